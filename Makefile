@@ -1,0 +1,31 @@
+# Everything runs in .venv, which the first target makes; only Python 3.11+, make and git are needed beforehand.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.PHONY: demo test lint bench clean
+.DEFAULT_GOAL := demo
+
+$(STAMP): pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "rmis_calib needs Python 3.11 or newer; set PYTHON=/path/to/python3.11")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@touch $@
+
+demo: $(STAMP)  ## render a stereo recording, calibrate it, leave demo_output/report.html
+	$(BIN)/rmis-calib demo --out demo_output --overwrite
+
+test: $(STAMP)  ## every test, the import contracts and the README's blocks
+	$(BIN)/python -m pytest -q
+
+lint: $(STAMP)  ## ruff and pyright
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/pyright
+
+bench: $(STAMP)  ## every table that the README quotes (long)
+	set -e; for f in tests/benchmarks/bench_*.py; do echo "== $$f"; $(BIN)/python $$f; done
+
+clean:
+	rm -rf $(VENV) demo_output build dist .pytest_cache .ruff_cache .hypothesis
