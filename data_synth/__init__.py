@@ -1,0 +1,22 @@
+"""Synthetic laparoscopy with exact truth: scenes, pictures, recordings and line studies. Imports nothing of rmis_calib."""
+
+from importlib import import_module
+from typing import Any
+
+_EXPORTS = {
+    "LineStudyConfig": "settings",
+    "SceneSettings": "settings",
+    "simulate_lines": "lines",
+}
+
+__all__ = sorted(_EXPORTS)  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _EXPORTS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_EXPORTS[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

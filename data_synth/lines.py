@@ -1,0 +1,123 @@
+"""Lines without pictures: batched Monte-Carlo trials of the calibration's input, with its truth. float64 NumPy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from data_synth.contours import contact_points, to_image, view_cylinder, visible_interval
+from data_synth.kinematics import Array, pose_noise, random_rotations, rigid, rigid_inverse, transform_points
+from data_synth.motion import joint_grid
+from data_synth.scene import Poses, Scene, build_scene, poses_at
+from data_synth.settings import LineStudyConfig
+
+SHORTEST_VISIBLE_MM = 10.0
+"""A shaft of which less is in the picture is not measured."""
+
+
+def simulate_lines(config: LineStudyConfig) -> dict[str, Any]:
+    """Observations of `config.trials` independent trials in the keys of an observations file, each with a leading trials axis.
+
+    Noise: the given `arm_T_rcm` is the true one right-multiplied by (exp(eps), eps); each camera sees the true pose of the RCM frame,
+    right-multiplied in the same way and independently (`camera_noise_*`); the given stereo extrinsics are the true ones right-multiplied
+    once a trial; then every image point gets isotropic Gaussian noise.
+
+    Returns:
+        arrays (trials, N, ...) and scalars, plus `truth`: camera_right_T_arm (trials, 4, 4), camera_left_T_camera_right (trials, 4, 4),
+        arm_T_rcm (trials, N, 4, 4) without noise, camera_right_T_rcm and camera_left_T_rcm (trials, N, 4, 4) as the pictures see them, and
+        shaft_end_offset_mm. Rows that are not in the picture are NaN and not valid.
+    """
+    generator = np.random.default_rng(config.seed)
+    scene = build_scene(config.scene)
+    poses = _true_poses(config, scene, generator)
+    trials, n = config.trials, poses.rcm_v_axis.shape[-2]
+    camera_right_T_arm = _hand_eye(config, scene, generator)[:, None]
+    camera_right_T_rcm = scene.camera_right_T_arm @ poses.arm_T_rcm
+    arm_T_rcm = np.broadcast_to(rigid_inverse(camera_right_T_arm) @ camera_right_T_rcm, (trials, n, 4, 4))
+
+    def noise(shape: tuple[int, ...], source: str) -> Array:
+        sigma_deg, sigma_mm = getattr(config, f"{source}_noise_deg"), getattr(config, f"{source}_noise_mm")
+        return pose_noise(generator, shape, np.deg2rad(sigma_deg), sigma_mm)
+
+    seen_right = camera_right_T_rcm @ noise((trials, n), "camera")
+    seen_left = scene.camera_left_T_camera_right @ camera_right_T_rcm @ noise((trials, n), "camera")
+    stereo = np.broadcast_to(scene.camera_left_T_camera_right, (trials, 4, 4))
+    out: dict[str, Any] = {
+        "arm_T_rcm": arm_T_rcm @ noise((trials, n), "kinematics"),
+        "rcm_v_axis": np.broadcast_to(poses.rcm_v_axis, (trials, n, 3)).copy(),
+        "rcm_s_end_mm": np.broadcast_to(poses.rcm_s_end_mm, (trials, n)).copy(),
+        "rcm_p_head": np.broadcast_to(poses.rcm_p_head, (trials, n, 3)).copy(),
+        "camera_left_T_camera_right": stereo @ noise((trials,), "stereo"),
+        "shaft_radius_mm": scene.shaft_radius_mm,
+        "sigma_image": config.pixel_noise_px / config.focal_px,
+    }
+    for source in ("kinematics", "camera", "stereo"):
+        out[f"sigma_{source}_mm"] = getattr(config, f"{source}_noise_mm")
+        out[f"sigma_{source}_rad"] = float(np.deg2rad(getattr(config, f"{source}_noise_deg")))
+    out |= _measure(config, scene, seen_right, poses, generator, "right")
+    out |= _measure(config, scene, seen_left, poses, generator, "left")
+    out["truth"] = {
+        "camera_right_T_arm": camera_right_T_arm[:, 0],
+        "camera_left_T_camera_right": stereo.copy(),
+        "arm_T_rcm": arm_T_rcm.copy(),
+        "camera_right_T_rcm": seen_right,
+        "camera_left_T_rcm": seen_left,
+        "shaft_end_offset_mm": scene.shaft_end_offset_mm,
+    }
+    return out
+
+
+def _true_poses(config: LineStudyConfig, scene: Scene, generator: np.random.Generator) -> Poses:
+    """Poses of all motions, (N, ...) on a grid and (trials, N, ...) at random."""
+    half_range = 0.5 * np.array([np.deg2rad(config.rotation_range_deg)] * 2 + [config.translation_range_mm])
+    if config.motion == "grid":
+        laparoscope = joint_grid(config.positions_laparoscope) * half_range
+        instrument = joint_grid(config.positions_instrument) * half_range
+        laparoscope, instrument = (
+            np.repeat(laparoscope, len(instrument), axis=0),
+            np.tile(instrument, (len(laparoscope), 1)),
+        )
+    else:
+        shape = (config.trials, config.random_motions, 3)
+        moving = float(config.positions_laparoscope > 1)
+        laparoscope = moving * generator.uniform(-1.0, 1.0, shape) * half_range
+        instrument = generator.uniform(-1.0, 1.0, shape) * half_range
+    return poses_at(scene, scene.laparoscope_home + laparoscope, scene.instrument_home + instrument)
+
+
+def _hand_eye(config: LineStudyConfig, scene: Scene, generator: np.random.Generator) -> Array:
+    """The unknown of every trial, (trials, 4, 4)."""
+    if not config.random_hand_eye:
+        return np.broadcast_to(scene.camera_right_T_arm, (config.trials, 4, 4)).copy()
+    directions = generator.standard_normal((config.trials, 3))
+    length = np.linalg.norm(scene.camera_right_T_arm[:3, 3])
+    translations = length * directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    return rigid(random_rotations(generator, (config.trials,)), translations)
+
+
+def _measure(
+    config: LineStudyConfig, scene: Scene, camera_T_rcm: Array, poses: Poses, generator: np.random.Generator, side: str
+) -> dict[str, Array]:
+    """What one camera measures: two points on the axis and on each contour, the shaft's end, the head point; RCM side first."""
+    p_axis = camera_T_rcm[..., :3, 3]
+    v_axis = np.einsum("...ij,...j->...i", camera_T_rcm[..., :3, :3], np.broadcast_to(poses.rcm_v_axis, p_axis.shape))
+    half_width, half_height = config.half_width_px / config.focal_px, config.half_height_px / config.focal_px
+    bounds = (-half_width, -half_height, half_width, half_height)
+    s_end = np.broadcast_to(poses.rcm_s_end_mm + scene.shaft_end_offset_mm, p_axis.shape[:-1])
+    low, high = visible_interval(p_axis, v_axis, 0.0, s_end, bounds)
+    valid = high - low > SHORTEST_VISIBLE_MM
+    low, high = np.where(valid, low, np.nan), np.where(valid, high, np.nan)
+    axis_points = p_axis[..., None, :] + np.stack([low, high], axis=-1)[..., None] * v_axis[..., None, :]
+    view = view_cylinder(p_axis, v_axis, scene.shaft_radius_mm)
+    contour = np.stack([contact_points(axis_points[..., i, :], view, scene.shaft_radius_mm) for i in range(2)], axis=-2)
+    end = np.where((valid & (high == s_end))[..., None], p_axis + s_end[..., None] * v_axis, np.nan)
+    head = transform_points(camera_T_rcm, np.broadcast_to(poses.rcm_p_head, p_axis.shape))
+    sigma = config.pixel_noise_px / config.focal_px
+
+    def noisy(points: Array) -> Array:
+        image = to_image(points)
+        return image + sigma * generator.standard_normal(image.shape)
+
+    measured = {"axis": noisy(axis_points), "contour": noisy(contour), "end": noisy(end), "head": noisy(head)}
+    return {f"{name}_{side}": value for name, value in measured.items()} | {f"valid_{side}": valid}

@@ -1,0 +1,173 @@
+"""The operating scene: two arms that pivot about their remote centres of motion, and the transform that a calibration must find.
+
+Every number of the geometry is in `SceneSettings` (settings.py); here they become DH tables and exact float64 poses.
+Frames: `base`, `arm` (end of the laparoscope's arm), `rcm` (the instrument's remote centre of motion), `camera_right`, `camera_left`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from data_synth.kinematics import (
+    Arm,
+    Array,
+    Joint,
+    arm_to_dict,
+    rigid,
+    rigid_inverse,
+    rotation_from_rotvec,
+    transform_points,
+)
+from data_synth.settings import SceneSettings
+
+HALF_PI = np.pi / 2.0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Arms and fixed transforms; `*_home` are the joint readings in the middle of the motion (rad, rad, mm)."""
+
+    laparoscope: Arm
+    instrument: Arm
+    laparoscope_home: Array
+    instrument_home: Array
+    camera_right_T_arm: Array
+    camera_left_T_camera_right: Array
+    base_T_camera_home: Array
+    shaft_radius_mm: float
+    shaft_end_offset_mm: float
+
+    def robot_dict(self, name: str, *, laparoscope: bool = True) -> dict:
+        """The content of robot.yaml."""
+        arms = {"laparoscope": arm_to_dict(self.laparoscope, instrument=False)} if laparoscope else {}
+        return {
+            "name": name,
+            "dh_convention": "modified",
+            "arms": arms | {"instrument": arm_to_dict(self.instrument, instrument=True)},
+        }
+
+
+def _rcm_joints(insertion_offset_mm: float) -> tuple[Joint, ...]:
+    """Yaw, pitch and insertion through one point: the z axis of the last frame is the shaft and passes through the origin of frame 0."""
+    return (
+        Joint("yaw", "revolute", HALF_PI, 0.0, 0.0, 0.0, HALF_PI),
+        Joint("pitch", "revolute", -HALF_PI, 0.0, 0.0, 0.0, -HALF_PI),
+        Joint("insertion", "prismatic", HALF_PI, 0.0, 0.0, 0.0, insertion_offset_mm),
+    )
+
+
+def _frame_along(direction: Array, roll_rad: float) -> Array:
+    """Rotation whose z axis is `direction`, turned by `roll_rad` about it."""
+    z = direction / np.linalg.norm(direction)
+    helper = np.eye(3)[int(np.argmin(np.abs(z)))]
+    x = np.cross(helper, z)
+    x /= np.linalg.norm(x)
+    frame = np.stack([x, np.cross(z, x), z], axis=-1)
+    return frame @ rotation_from_rotvec([0.0, 0.0, roll_rad])
+
+
+def _place_arm(joints: tuple[Joint, ...], home: Array, base_T_end: Array) -> Array:
+    """base_T_arm_base that puts the last frame at `base_T_end` when the readings are `home`."""
+    arm_base_T_end = Arm(np.eye(4), joints).frames(home)[-1]
+    return base_T_end @ rigid_inverse(arm_base_T_end)
+
+
+def build_scene(settings: SceneSettings) -> Scene:
+    """Scene whose geometry, seen from the right camera with all joints at home, is that of `settings`.
+
+    Convention: positions in `settings` are in camera_right at home; the laparoscope's shaft is its optical axis.
+    """
+    camera_right_T_arm = rigid(
+        rotation_from_rotvec(np.deg2rad(settings.hand_eye_rotvec_deg)), settings.hand_eye_translation_mm
+    )
+    base_T_camera_home = rigid(
+        rotation_from_rotvec(np.deg2rad(settings.camera_home_rotvec_deg)), settings.camera_home_translation_mm
+    )
+    # Laparoscope: last DH frame on the optical axis, 20 mm behind the camera, so that `end_T_tool` is not the identity.
+    camera_T_end = rigid(rotation_from_rotvec([0.0, 0.0, 0.6]), [0.0, 0.0, -20.0])
+    laparoscope_joints = _rcm_joints(insertion_offset_mm=15.0)
+    laparoscope_home = np.array([0.10, -0.15, settings.laparoscope_rcm_behind_mm - 20.0 - 15.0])
+    laparoscope = Arm(
+        base_T_arm_base=_place_arm(laparoscope_joints, laparoscope_home, base_T_camera_home @ camera_T_end),
+        joints=laparoscope_joints,
+        end_T_tool=rigid_inverse(camera_T_end) @ camera_right_T_arm,
+    )
+    # Instrument: last DH frame at the head point (the axis of the claspers), on the shaft's axis.
+    camera_p_rcm = np.asarray(settings.instrument_rcm_mm, dtype=np.float64)
+    camera_v_axis = np.asarray(settings.target_mm, dtype=np.float64) - camera_p_rcm
+    depth_mm = float(np.linalg.norm(camera_v_axis))
+    camera_T_head = rigid(_frame_along(camera_v_axis, roll_rad=-0.9), settings.target_mm)
+    head_beyond_end_frame_mm = 4.0
+    instrument_joints = _rcm_joints(insertion_offset_mm=-30.0)
+    instrument_home = np.array([-0.20, 0.12, depth_mm - head_beyond_end_frame_mm + 30.0])
+    end_T_head = rigid(np.eye(3), [0.0, 0.0, head_beyond_end_frame_mm])
+    base_T_end = base_T_camera_home @ camera_T_head @ rigid_inverse(end_T_head)
+    instrument = Arm(
+        base_T_arm_base=_place_arm(instrument_joints, instrument_home, base_T_end),
+        joints=instrument_joints,
+        rcm_frame=0,
+        shaft_frame=3,
+        head_frame=3,
+        head_xyz_mm=(0.0, 0.0, head_beyond_end_frame_mm),
+    )
+    return Scene(
+        laparoscope=laparoscope,
+        instrument=instrument,
+        laparoscope_home=laparoscope_home,
+        instrument_home=instrument_home,
+        camera_right_T_arm=camera_right_T_arm,
+        camera_left_T_camera_right=rigid(
+            rotation_from_rotvec(np.deg2rad(settings.stereo_rotvec_deg)), settings.stereo_translation_mm
+        ),
+        base_T_camera_home=base_T_camera_home,
+        shaft_radius_mm=settings.shaft_diameter_mm / 2.0,
+        shaft_end_offset_mm=-settings.wrist_length_mm,
+    )
+
+
+@dataclass(frozen=True)
+class Poses:
+    """What the joint readings say (...: any batch): poses (..., 4, 4), axis and head point (..., 3), nominal shaft end (...), mm."""
+
+    base_T_arm: Array
+    arm_T_rcm: Array
+    rcm_v_axis: Array
+    rcm_p_head: Array
+    rcm_s_end_mm: Array
+
+
+def poses_at(scene: Scene, laparoscope_readings: Array, instrument_readings: Array) -> Poses:
+    """Forward kinematics of both arms at readings (..., 3)."""
+    base_T_arm = scene.laparoscope.tool(laparoscope_readings)
+    shaft = scene.instrument.shaft(instrument_readings)
+    return Poses(
+        base_T_arm, rigid_inverse(base_T_arm) @ shaft.base_T_rcm, shaft.rcm_v_axis, shaft.rcm_p_head, shaft.rcm_s_end_mm
+    )
+
+
+@dataclass(frozen=True)
+class ShaftInCamera:
+    """One shaft seen from one camera: points on the axis at coordinate s are camera_p_rcm + s camera_v_axis; (..., 3) and (...), mm."""
+
+    camera_p_rcm: Array
+    camera_v_axis: Array
+    s_end_mm: Array
+    camera_p_head: Array
+    radius_mm: float
+
+    def axis_point(self, s_mm: Array | float) -> Array:
+        """Points (..., 3) on the axis at coordinates s (...)."""
+        return self.camera_p_rcm + np.asarray(s_mm)[..., None] * self.camera_v_axis
+
+
+def shaft_in_camera(scene: Scene, camera_T_rcm: Array, poses: Poses) -> ShaftInCamera:
+    """The instrument's shaft in a camera, from the true pose of the RCM frame (..., 4, 4) in it."""
+    return ShaftInCamera(
+        camera_p_rcm=camera_T_rcm[..., :3, 3],
+        camera_v_axis=np.einsum("...ij,...j->...i", camera_T_rcm[..., :3, :3], poses.rcm_v_axis),
+        s_end_mm=np.broadcast_to(poses.rcm_s_end_mm + scene.shaft_end_offset_mm, camera_T_rcm.shape[:-2]),
+        camera_p_head=transform_points(camera_T_rcm, poses.rcm_p_head),
+        radius_mm=scene.shaft_radius_mm,
+    )
