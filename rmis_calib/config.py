@@ -1,0 +1,104 @@
+"""The configuration of a calibration: one definition for Python, YAML presets and command-line flags.
+
+Nothing here has to be set: `CalibrationConfig()` runs the whole pipeline. Precedence: defaults < one YAML file < flags.
+"""
+
+import difflib
+from dataclasses import asdict, field
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import ConfigDict, TypeAdapter, ValidationError, field_validator
+from pydantic.dataclasses import dataclass
+
+from rmis_calib.errors import ConfigError
+from rmis_calib.io.configs import config_path, load_yaml
+from rmis_calib.solver.settings import SolverSettings
+from rmis_calib.vision.settings import DetectorSettings
+
+Measurement = Literal["axis", "contours", "ends", "heads"]
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid", allow_inf_nan=False))
+class CalibrationConfig:
+    """Everything a calibration can be told."""
+
+    device: str = "cpu"
+    """Where images and estimation live: `cpu`, `cuda` or `cuda:N`."""
+    batch_size: int = 8
+    """Frames decoded, moved and detected together."""
+    measurements: tuple[Measurement, ...] = ("axis", "contours", "ends")
+    """What the estimate may use of each picture. `heads` uses labelled head points, which are otherwise kept for evaluation."""
+    min_motions: int = 6
+    """Fewest motions with a usable shaft."""
+    detector: DetectorSettings = field(default_factory=DetectorSettings)
+    """Finding the shaft in a picture."""
+    solver: SolverSettings = field(default_factory=SolverSettings)
+    """Estimating the transform."""
+
+    @field_validator("device")
+    @classmethod
+    def _known_device(cls, value: str) -> str:
+        kind, _, index = value.partition(":")
+        if kind not in ("cpu", "cuda") or (index and not index.isdigit()) or value.endswith(":"):
+            raise ValueError("a device is cpu, cuda or cuda:N")
+        return value
+
+    @field_validator("batch_size", "min_motions")
+    @classmethod
+    def _positive(cls, value: int) -> int:
+        if value < 1:
+            raise ValueError("must be at least 1")
+        return value
+
+    @field_validator("measurements")
+    @classmethod
+    def _some_measurement(cls, value: tuple[Measurement, ...]) -> tuple[Measurement, ...]:
+        if not {"axis", "contours", "heads"} & set(value):
+            raise ValueError("at least one of axis, contours, heads is needed")
+        return value
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def parse_config(raw: dict[str, Any], where: str = "config") -> CalibrationConfig:
+    """A configuration from plain values.
+
+    Raises:
+        ConfigError: an unknown key or an impossible value; names the key.
+    """
+    try:
+        return TypeAdapter(CalibrationConfig).validate_python(raw)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        if first["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
+            known = _known_keys(first["loc"][:-1])
+            near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
+            hint = f" (did you mean {near[0]}?)" if near else ""
+            raise ConfigError(where=f"{where}: {key}", expected=f"a known key{hint}", found="an unknown one") from None
+        raise ConfigError(where=f"{where}: {key}", expected=first["msg"], found=repr(first["input"])) from None
+
+
+def load_config(name_or_path: str | Path) -> CalibrationConfig:
+    """A configuration from a YAML file, or from a shipped preset by name (`configs/calibration`).
+
+    Raises:
+        ConfigError: an unknown key or an impossible value; names file and key.
+        FileError: no such file or preset.
+    """
+    path = Path(name_or_path)
+    if path.suffix not in (".yaml", ".yml"):
+        path = config_path("calibration", str(name_or_path))
+    raw = load_yaml(path)
+    if not isinstance(raw, dict):
+        raise ConfigError(where=str(path), expected="a mapping of keys", found=type(raw).__name__)
+    return parse_config(raw, where=str(path))
+
+
+def _known_keys(parents: tuple[Any, ...]) -> list[str]:
+    node: Any = CalibrationConfig()
+    for part in parents:
+        node = getattr(node, str(part), node)
+    return list(asdict(node))

@@ -1,0 +1,237 @@
+"""What a calibration answers: the transform with its uncertainty, what was used, and whether to trust it.
+
+`CalibrationResult` is the Python object and, through `write` and `read`, the file `result.json` (format
+`rmis-calib-result/1`). Unknown numbers are `None` in Python and null in the file, never NaN.
+"""
+
+import json
+import math
+import platform
+from collections import Counter
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from rmis_calib import __version__
+from rmis_calib.errors import FileError, InputError
+from rmis_calib.geometry.rigid import RigidTransform
+from rmis_calib.io.atomic import write_json
+
+RESULT_FORMAT = "rmis-calib-result/1"
+Status = Literal["ok", "weak", "unobservable", "solver_failed", "insufficient_data"]
+
+STATUS_SENTENCES: dict[str, str] = {
+    "ok": "the result passed its own checks",
+    "weak": "the data constrain the transform too loosely to be trusted",
+    "unobservable": "the data cannot tell the transform",
+    "solver_failed": "the solver did not reach a solution",
+    "insufficient_data": "too few motions with a usable shaft",
+}
+
+
+@dataclass(frozen=True)
+class Motions:
+    """Which motions carried the result.
+
+    Attributes:
+        used: (N,) whether the motion entered the estimate.
+        reasons: (N,) why a motion did not enter; empty for a used one.
+        timestamps_s: (N,) frame times, where known.
+    """
+
+    used: np.ndarray
+    reasons: tuple[str, ...]
+    timestamps_s: np.ndarray | None = None
+
+    @property
+    def rejected_by_reason(self) -> dict[str, int]:
+        return dict(Counter(reason for reason, used in zip(self.reasons, self.used, strict=True) if not used))
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "total": len(self.used),
+            "used": int(self.used.sum()),
+            "rejected": self.rejected_by_reason,
+            "used_by_motion": self.used.tolist(),
+            "reason_by_motion": list(self.reasons),
+            "timestamps_s": None if self.timestamps_s is None else self.timestamps_s.tolist(),
+        }
+
+    @classmethod
+    def from_dict(cls, raw: dict[str, Any]) -> "Motions":
+        times = raw.get("timestamps_s")
+        return cls(
+            np.asarray(raw["used_by_motion"], dtype=bool),
+            tuple(raw["reason_by_motion"]),
+            None if times is None else np.asarray(times, dtype=float),
+        )
+
+
+@dataclass(frozen=True)
+class CalibrationResult:
+    """The hand-eye transform, how sure it is, and what it rests on.
+
+    Attributes:
+        status: "ok" only for a result that passed its own checks.
+        message: one line: why it is, or is not, to be trusted.
+        method: `paper`, `global` or `joint`.
+        camera_right_T_arm: pose of the laparoscope arm's end-effector frame in the right camera, mm; None without a solution.
+        camera_left_T_camera_right: stereo extrinsics as used (refined where the method refines them); None for one camera.
+        covariance: (6, 6), rotation first: R = exp(dphi) R^ in the camera frame, t = t^ + dt; rad and mm.
+        observability: verdict, predicted error at the working point, and what the data cannot see, in words.
+        motions: used and rejected motions.
+        residuals: per measurement kind `{unit, median, rms, by_motion}`; by_motion is (N,) with None where not measured.
+        nuisances: other unknowns and settings estimated with it: name -> `{value, sigma, unit}`.
+        head_point_error_px: per camera `{median, rms, max, count}`, where head points are known.
+        config: the resolved configuration.
+        versions: of this package and of what it computes with.
+    """
+
+    status: Status
+    message: str
+    method: str
+    camera_right_T_arm: RigidTransform | None
+    camera_left_T_camera_right: RigidTransform | None
+    covariance: np.ndarray | None
+    observability: dict[str, Any]
+    motions: Motions
+    residuals: dict[str, dict[str, Any]] = field(default_factory=dict)
+    nuisances: dict[str, dict[str, Any]] = field(default_factory=dict)
+    head_point_error_px: dict[str, dict[str, Any]] | None = None
+    config: dict[str, Any] = field(default_factory=dict)
+    versions: dict[str, str] = field(default_factory=lambda: package_versions())
+    created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
+
+    @property
+    def trustworthy(self) -> bool:
+        return self.status == "ok"
+
+    @property
+    def camera_left_T_arm(self) -> RigidTransform | None:
+        """The same arm seen from the left camera."""
+        if self.camera_right_T_arm is None or self.camera_left_T_camera_right is None:
+            return None
+        return self.camera_left_T_camera_right @ self.camera_right_T_arm
+
+    @property
+    def rotation_sigma_deg(self) -> float | None:
+        """Root of the trace of the rotation block, degrees."""
+        return None if self.covariance is None else math.degrees(math.sqrt(np.trace(self.covariance[:3, :3])))
+
+    @property
+    def translation_sigma_mm(self) -> float | None:
+        """Root of the trace of the translation block, mm."""
+        return None if self.covariance is None else math.sqrt(np.trace(self.covariance[3:, 3:]))
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain JSON values, every number finite or None."""
+        record = {
+            "format": RESULT_FORMAT,
+            "status": self.status,
+            "message": self.message,
+            "method": self.method,
+            "camera_right_T_arm": _transform_dict(self.camera_right_T_arm),
+            "camera_left_T_arm": _transform_dict(self.camera_left_T_arm),
+            "camera_left_T_camera_right": _transform_dict(self.camera_left_T_camera_right),
+            "covariance": self.covariance,
+            "rotation_sigma_deg": self.rotation_sigma_deg,
+            "translation_sigma_mm": self.translation_sigma_mm,
+            "observability": self.observability,
+            "motions": self.motions.to_dict(),
+            "residuals": self.residuals,
+            "nuisances": self.nuisances,
+            "head_point_error_px": self.head_point_error_px,
+            "config": self.config,
+            "versions": self.versions,
+            "created": self.created,
+        }
+        return finite_or_none(record)
+
+    def write(self, path: str | Path) -> None:
+        """Write `result.json`, whole or not at all.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        write_json(Path(path), self.to_dict())
+
+    @classmethod
+    def read(cls, path: str | Path) -> "CalibrationResult":
+        """Read a `result.json`.
+
+        Raises:
+            FileError: the file cannot be read.
+            InputError: it is not a result of this format.
+        """
+        try:
+            raw = json.loads(Path(path).read_text(encoding="utf-8"))
+        except OSError as error:
+            raise FileError(where=str(path), expected="a readable result file", found=error.strerror) from error
+        except ValueError as error:
+            raise InputError(where=str(path), expected="JSON", found=str(error)) from error
+        found = raw.get("format") if isinstance(raw, dict) else type(raw).__name__
+        if found != RESULT_FORMAT:
+            raise InputError(where=str(path), expected=f"format {RESULT_FORMAT}", found=found)
+        try:
+            return cls._from_dict(raw)
+        except (KeyError, TypeError) as error:
+            raise InputError(
+                where=str(path), expected="every key of a result", found=f"missing or odd {error}"
+            ) from error
+
+    @classmethod
+    def _from_dict(cls, raw: dict[str, Any]) -> "CalibrationResult":
+        covariance = raw["covariance"]
+        return cls(
+            status=raw["status"],
+            message=raw["message"],
+            method=raw["method"],
+            camera_right_T_arm=_transform(raw["camera_right_T_arm"]),
+            camera_left_T_camera_right=_transform(raw["camera_left_T_camera_right"]),
+            covariance=None if covariance is None else np.asarray(covariance, dtype=float),
+            observability=raw["observability"],
+            motions=Motions.from_dict(raw["motions"]),
+            residuals=raw["residuals"],
+            nuisances=raw["nuisances"],
+            head_point_error_px=raw["head_point_error_px"],
+            config=raw["config"],
+            versions=raw["versions"],
+            created=raw["created"],
+        )
+
+
+def _transform_dict(transform: RigidTransform | None) -> dict[str, Any] | None:
+    return None if transform is None else transform.to_dict()
+
+
+def _transform(raw: dict[str, Any] | None) -> RigidTransform | None:
+    return None if raw is None else RigidTransform.from_dict(raw)
+
+
+def finite_or_none(value: Any) -> Any:
+    """Plain JSON values: arrays as lists, numbers that are not finite as None."""
+    if isinstance(value, dict):
+        return {str(key): finite_or_none(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return finite_or_none(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [finite_or_none(item) for item in value]
+    if isinstance(value, np.generic):
+        return finite_or_none(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Path):
+        return str(value)
+    return value
+
+
+def package_versions() -> dict[str, str]:
+    """Versions of this package, of Python and of the libraries that enter the numbers."""
+    names = ("torch", "kornia", "pytorch-kinematics", "opencv-python-headless", "numpy", "av")
+    return {"rmis_calib": __version__, "python": platform.python_version()} | {
+        name: metadata.version(name) for name in names
+    }
