@@ -1,0 +1,189 @@
+"""Joint readings of both arms to the transforms that the calibration needs."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rmis_calib.errors import RobotError, ShapeError
+from rmis_calib.geometry.rigid import rigid_inverse, transform_points
+from rmis_calib.kinematics.dh import JointRow, build_chain, frame_poses
+
+# A shaft that misses its remote centre by more than this has the wrong frame number or the wrong table: real tables
+# miss it by micrometres, and a wrong frame by centimetres.
+_MAX_RCM_MISS_MM = 1.0
+
+
+class HeadPointTable(Protocol):
+    """A point of the instrument's head that can be seen, fixed in one of its frames."""
+
+    @property
+    def frame(self) -> int: ...
+    @property
+    def xyz_mm(self) -> Sequence[float]: ...
+
+
+class ArmTable(Protocol):
+    """One arm of a robot description; what only one of the two arms has is None for the other."""
+
+    @property
+    def base_T_arm_base(self) -> np.ndarray: ...
+    @property
+    def joints(self) -> Sequence[JointRow]: ...
+    @property
+    def end_T_tool(self) -> np.ndarray | None: ...
+    @property
+    def rcm_frame(self) -> int | None: ...
+    @property
+    def shaft_frame(self) -> int | None: ...
+    @property
+    def head_point(self) -> HeadPointTable | None: ...
+
+
+class RobotTable(Protocol):
+    """A robot description, as `io.load_robot` reads it."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def dh_convention(self) -> str: ...
+    @property
+    def arms(self) -> Mapping[str, ArmTable]: ...
+
+
+@dataclass(frozen=True, eq=False)
+class InstrumentPose:
+    """Where the instrument is, one for every set of readings."""
+
+    base_T_rcm: Float[Tensor, "*batch 4 4"]
+    """Frame at the remote centre of motion; its origin lies on the shaft axis."""
+    rcm_v_axis: Float[Tensor, "*batch 3"]
+    """Unit direction of the shaft, RCM towards tip."""
+    rcm_p_head: Float[Tensor, "*batch 3"]
+    """Head point, mm."""
+    rcm_s_end_mm: Float[Tensor, "*batch"]
+    """Nominal place of the shaft's end, as its coordinate along the axis from the RCM, known up to one constant."""
+
+
+class RobotKinematics:
+    """Forward kinematics of the arm that carries the laparoscope and of the one that carries the instrument.
+
+    Everything is differentiable in the readings, and so in joint offsets that are added to them.
+
+    Args:
+        robot: description with both arms.
+        laparoscope_arm: its name in the description; None where the camera stands still, so that `arm` is `base`.
+        instrument_arm: its name in the description.
+        dtype: of all tensors; readings must have it too.
+        device: of all tensors.
+    Raises:
+        RobotError: an arm, a frame number or a head point is missing or impossible, or the shaft misses the RCM.
+    """
+
+    def __init__(
+        self,
+        robot: RobotTable,
+        laparoscope_arm: str | None,
+        instrument_arm: str,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self._laparoscope = None if laparoscope_arm is None else _Arm(robot, laparoscope_arm, dtype, device)
+        self._instrument = _Arm(robot, instrument_arm, dtype, device)
+        self.laparoscope_joints = () if self._laparoscope is None else self._laparoscope.names
+        """Names of the laparoscope arm's joints, in the order of its readings."""
+        self.instrument_joints = self._instrument.names
+        """Names of the instrument arm's joints, in the order of its readings."""
+        self._dtype, self._device = dtype, device
+        table, where = robot.arms[instrument_arm], f"robot {robot.name}, arm {instrument_arm}"
+        self._rcm_frame = _frame_number(table.rcm_frame, table, f"{where}, rcm_frame")
+        self._shaft_frame = _frame_number(table.shaft_frame, table, f"{where}, shaft_frame")
+        if table.head_point is None:
+            raise RobotError(where=where, expected="a head_point", found="none")
+        self._head_frame = _frame_number(table.head_point.frame, table, f"{where}, head_point.frame")
+        self._head_p_point = torch.tensor(list(table.head_point.xyz_mm), dtype=dtype, device=device)
+        self._check_shaft_meets_rcm(where)
+
+    def base_T_arm(self, joints: Float[Tensor, "*batch j"]) -> Float[Tensor, "*batch 4 4"]:
+        """End-effector frame of the laparoscope arm, its tool transform included; the identity where there is no arm.
+
+        Args:
+            joints: readings of `laparoscope_joints`, rad or mm; (..., 0) where there is no arm.
+        Raises:
+            ShapeError: another number of joints, or another dtype.
+        """
+        if self._laparoscope is not None:
+            return self._laparoscope.base_T_frames(joints)[..., -1, :, :] @ self._laparoscope.end_T_tool
+        if joints.shape[-1] != 0:
+            raise ShapeError(where="laparoscope readings", expected="(..., 0): no arm", found=tuple(joints.shape))
+        return torch.eye(4, dtype=self._dtype, device=self._device).expand(*joints.shape[:-1], 4, 4)
+
+    def instrument(self, joints: Float[Tensor, "*batch j"]) -> InstrumentPose:
+        """Remote centre, shaft axis, head point and shaft end of the instrument.
+
+        Args:
+            joints: readings of `instrument_joints`, rad or mm.
+        Raises:
+            ShapeError: another number of joints, or another dtype.
+        """
+        # With the wrist straight the head point is a place on the shaft, whatever the wrist does now.
+        before_wrist = torch.arange(joints.shape[-1], device=joints.device) < self._shaft_frame
+        straight = torch.where(before_wrist, joints, 0.0)
+        both = self._instrument.base_T_frames(torch.stack([joints, straight]))
+        base_T_rcm = both[0, ..., self._rcm_frame, :, :]
+        rcm_T_base = rigid_inverse(base_T_rcm)
+        rcm_T_shaft = rcm_T_base @ both[0, ..., self._shaft_frame, :, :]
+        rcm_v_axis = rcm_T_shaft[..., :3, 2]
+        base_T_head = both[..., self._head_frame, :, :]
+        rcm_p_head, rcm_p_straight = transform_points(rcm_T_base @ base_T_head, self._head_p_point).unbind(0)
+        return InstrumentPose(base_T_rcm, rcm_v_axis, rcm_p_head, (rcm_v_axis * rcm_p_straight).sum(-1))
+
+    def _check_shaft_meets_rcm(self, where: str) -> None:
+        # Two poses far apart: a wrong frame can agree at one of them.
+        count = len(self.instrument_joints)
+        readings = torch.stack([torch.zeros(count), torch.full((count,), 0.5)]).to(self._device, self._dtype)
+        frames = self._instrument.base_T_frames(readings)
+        base_T_rcm, base_T_shaft = frames[:, self._rcm_frame], frames[:, self._shaft_frame]
+        shaft_T_rcm = rigid_inverse(base_T_shaft) @ base_T_rcm
+        miss = float(shaft_T_rcm[:, :2, 3].norm(dim=-1).max())
+        if miss > _MAX_RCM_MISS_MM:
+            expected = (
+                f"the z axis of shaft_frame {self._shaft_frame} through the origin of rcm_frame {self._rcm_frame}"
+            )
+            raise RobotError(where=where, expected=expected, found=f"a distance of {miss:.1f} mm")
+
+
+class _Arm:
+    """Chain of one arm with its constants as tensors."""
+
+    def __init__(self, robot: RobotTable, name: str, dtype: torch.dtype, device: torch.device | str) -> None:
+        if name not in robot.arms:
+            raise RobotError(where=f"robot {robot.name}", expected=f"an arm {name!r}", found=", ".join(robot.arms))
+        table = robot.arms[name]
+
+        def constant(value: object) -> Tensor:
+            return torch.as_tensor(np.asarray(value), dtype=dtype, device=device)
+
+        self.names = tuple(row.name for row in table.joints)
+        self.end_T_tool = constant(np.eye(4) if table.end_T_tool is None else table.end_T_tool)
+        self._base_T_arm_base = constant(table.base_T_arm_base)
+        self._offsets = constant([float(row.offset) for row in table.joints])
+        self._chain = build_chain(table.joints, robot.dh_convention, dtype, device)
+
+    def base_T_frames(self, joints: Float[Tensor, "*batch j"]) -> Float[Tensor, "*batch frames 4 4"]:
+        if joints.shape[-1] != len(self.names):
+            expected = f"(..., {len(self.names)}): {', '.join(self.names)}"
+            raise ShapeError(where="joint readings", expected=expected, found=tuple(joints.shape))
+        arm_base_T_frames = frame_poses(self._chain, joints + self._offsets)
+        return self._base_T_arm_base @ arm_base_T_frames
+
+
+def _frame_number(number: int | None, table: ArmTable, where: str) -> int:
+    count = len(table.joints)
+    if number is None or not 0 <= number <= count:
+        raise RobotError(where=where, expected=f"a frame number, 0 (the arm's base) to {count}", found=number)
+    return number
