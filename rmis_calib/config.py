@@ -28,7 +28,7 @@ class CalibrationConfig:
     batch_size: int = 8
     """Frames decoded, moved and detected together."""
     measurements: tuple[Measurement, ...] = ("axis", "contours", "ends")
-    """What the estimate may use of each picture. `heads` uses labelled head points, which are otherwise kept for evaluation."""
+    """What the estimate may use of each picture; `heads` are the labelled head points, else kept for evaluation."""
     min_motions: int = 6
     """Fewest motions with a usable shaft."""
     detector: DetectorSettings = field(default_factory=DetectorSettings)

@@ -79,12 +79,14 @@ class CalibrationResult:
         status: "ok" only for a result that passed its own checks.
         message: one line: why it is, or is not, to be trusted.
         method: `paper`, `global` or `joint`.
-        camera_right_T_arm: pose of the laparoscope arm's end-effector frame in the right camera, mm; None without a solution.
-        camera_left_T_camera_right: stereo extrinsics as used (refined where the method refines them); None for one camera.
+        camera_right_T_arm: pose of the laparoscope arm's end-effector frame in the right camera, mm; None without a
+            solution.
+        camera_left_T_camera_right: stereo extrinsics as used (refined where the method does); None for one camera.
         covariance: (6, 6), rotation first: R = exp(dphi) R^ in the camera frame, t = t^ + dt; rad and mm.
         observability: verdict, predicted error at the working point, and what the data cannot see, in words.
         motions: used and rejected motions.
-        residuals: per measurement kind `{unit, median, rms, by_motion}`; by_motion is (N,) with None where not measured.
+        residuals: per measurement kind `{unit, median, rms, by_motion}`; by_motion is (N,), None where not
+            measured.
         nuisances: other unknowns and settings estimated with it: name -> `{value, sigma, unit}`.
         head_point_error_px: per camera `{median, rms, max, count}`, where head points are known.
         config: the resolved configuration.
@@ -103,7 +105,7 @@ class CalibrationResult:
     nuisances: dict[str, dict[str, Any]] = field(default_factory=dict)
     head_point_error_px: dict[str, dict[str, Any]] | None = None
     config: dict[str, Any] = field(default_factory=dict)
-    versions: dict[str, str] = field(default_factory=lambda: package_versions())
+    versions: dict[str, str | None] = field(default_factory=lambda: package_versions())
     created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
 
     @property
@@ -229,9 +231,14 @@ def finite_or_none(value: Any) -> Any:
     return value
 
 
-def package_versions() -> dict[str, str]:
-    """Versions of this package, of Python and of the libraries that enter the numbers."""
+def package_versions() -> dict[str, str | None]:
+    """Versions of this package, of Python and of the libraries that enter the numbers; None for one not installed."""
     names = ("torch", "kornia", "pytorch-kinematics", "opencv-python-headless", "numpy", "av")
-    return {"rmis_calib": __version__, "python": platform.python_version()} | {
-        name: metadata.version(name) for name in names
-    }
+    return {"rmis_calib": __version__, "python": platform.python_version()} | {name: _version(name) for name in names}
+
+
+def _version(name: str) -> str | None:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
