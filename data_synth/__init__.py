@@ -1,4 +1,4 @@
-"""Synthetic laparoscopy with exact truth: scenes, pictures, recordings and line studies. Imports nothing of rmis_calib."""
+"""Synthetic laparoscopy with exact truth: scenes, pictures, recordings, line studies. Imports nothing of rmis_calib."""
 
 from importlib import import_module
 from typing import Any
@@ -6,7 +6,11 @@ from typing import Any
 _EXPORTS = {
     "LineStudyConfig": "settings",
     "SceneSettings": "settings",
+    "SynthConfig": "settings",
+    "load_synth_config": "presets",
     "simulate_lines": "lines",
+    "synth_presets": "presets",
+    "write_recording": "write",
 }
 
 __all__ = sorted(_EXPORTS)  # pyright: ignore[reportUnsupportedDunderAll]

@@ -87,3 +87,131 @@ class LineStudyConfig:
     """Rotational part of the same."""
     random_hand_eye: bool = False
     """Draw another camera_right_T_arm for every trial (rotation uniform on SO(3)); the camera's view stays the same."""
+
+
+@dataclass(frozen=True, config=_STRICT)
+class IntrinsicsSettings:
+    """One camera of the pair."""
+
+    fx_px: Positive = 702.4
+    """Horizontal focal length."""
+    fy_px: Positive = 701.1
+    """Vertical focal length."""
+    cx_px: float = 322.7
+    """Column of the principal point."""
+    cy_px: float = 236.4
+    """Row of the principal point."""
+    distortion: tuple[float, float, float, float, float] = (-0.2, 0.05, 0.0006, -0.0004, 0.0)
+    """k1, k2, p1, p2, k3."""
+
+
+@dataclass(frozen=True, config=_STRICT)
+class CameraSettings:
+    """The stereo laparoscope's cameras and what their optics and electronics do to the picture."""
+
+    width_px: Annotated[int, Field(ge=64)] = 640
+    """Width of the pictures."""
+    height_px: Annotated[int, Field(ge=64)] = 480
+    """Height of the pictures."""
+    right: IntrinsicsSettings = IntrinsicsSettings()
+    """Right camera."""
+    left: IntrinsicsSettings | None = IntrinsicsSettings(
+        fx_px=699.8, fy_px=698.9, cx_px=315.2, cy_px=241.9, distortion=(-0.19, 0.045, -0.0004, 0.0005, 0.0)
+    )
+    """Left camera; null: a monocular recording."""
+    blur_px: Annotated[float, Field(ge=0.3)] = 0.55
+    """1 sigma of the point spread (optics and pixel together); every edge is an error function of this width."""
+    noise_levels: NonNegative = 1.5
+    """White sensor noise, 1 sigma, in levels of 0 to 255."""
+    gamma: Positive = 2.2
+    """Encoding of linear light."""
+
+
+@dataclass(frozen=True, config=_STRICT)
+class MotionSettings:
+    """How the arms move and how that is logged."""
+
+    kind: Literal["random", "grid", "smooth"] = "random"
+    """`random`: stops at random places; `grid`: stops on a grid of joint positions; `smooth`: continuous video."""
+    laparoscope: Literal["moving", "static", "unlogged"] = "moving"
+    """`static`: logged but still; `unlogged`: still, and not in the recording (laparoscope_arm: null)."""
+    rotation_range_deg: NonNegative = 10.0
+    """Full range of the revolute joints."""
+    translation_range_mm: NonNegative = 20.0
+    """Full range of the prismatic joints."""
+    positions_laparoscope: Count = 3
+    """Grid positions a joint of the laparoscope; a seeded choice of the grid when it has more places than there are motions."""
+    positions_instrument: Count = 3
+    """Grid positions a joint of the instrument."""
+    stop_period_s: Positive = 0.5
+    """Time between two stops (`random` and `grid`); the frame is taken in the middle of the rest."""
+    frame_rate_hz: Positive = 30.0
+    """Frame rate of `smooth`."""
+    joint_rate_hz: Positive = 50.0
+    """Rate of joints.csv."""
+    keep_end_in_view: bool = True
+    """Draw `random` stops again until the shaft's end and the head point are in both pictures."""
+
+
+@dataclass(frozen=True, config=_STRICT)
+class NoiseSettings:
+    """How far the log is from the truth. Defaults: a well-calibrated robot."""
+
+    kinematics_mm: NonNegative = 0.1
+    """Translation noise of the instrument's pose against the joints, per axis and motion: the seen arm_T_rcm is the logged one, right-multiplied."""
+    kinematics_deg: NonNegative = 0.03
+    """Rotational part of the same."""
+    joint_reading_deg: NonNegative = 0.0
+    """White noise of logged revolute joints."""
+    joint_reading_mm: NonNegative = 0.0
+    """White noise of logged prismatic joints."""
+    stereo_mm: NonNegative = 0.0
+    """Error of the given stereo extrinsics, translation per axis."""
+    stereo_deg: NonNegative = 0.0
+    """Error of the given stereo extrinsics, rotation per axis."""
+    shaft_diameter_error_mm: float = 0.0
+    """Given minus true diameter of the shaft."""
+    head_point_px: NonNegative = 0.3
+    """Noise of head_points.csv."""
+
+
+@dataclass(frozen=True, config=_STRICT)
+class LookSettings:
+    """What the pictures show."""
+
+    shaft: Literal["dark_grey", "carbon", "anodised"] = "dark_grey"
+    """Surface of the shaft."""
+    wrist_radius_ratio: Annotated[float, Field(gt=0.3, le=1.0)] = 0.94
+    """Radius of the metal wrist over that of the shaft."""
+
+
+@dataclass(frozen=True, config=_STRICT)
+class OutputSettings:
+    """How the pictures are stored."""
+
+    pictures: Literal["video", "images"] = "video"
+    """H.264 (yuv444p) or folders of PNG."""
+    crf: Annotated[int, Field(ge=0, le=51)] = 10
+    """H.264 quality: 0 is lossless."""
+
+
+@dataclass(frozen=True, config=_STRICT)
+class SynthConfig:
+    """A synthetic recording."""
+
+    seed: int = 0
+    """Seed of everything that is random."""
+    motions: Count = 60
+    """Number of frames."""
+    scene: SceneSettings = SceneSettings()
+    """Geometry."""
+    camera: CameraSettings = CameraSettings()
+    """Cameras."""
+    motion: MotionSettings = MotionSettings()
+    """Motion of the arms."""
+    noise: NoiseSettings = NoiseSettings()
+    """Errors of the log."""
+    look: LookSettings = LookSettings()
+    """Appearance."""
+    output: OutputSettings = OutputSettings()
+    """Storage."""

@@ -1,0 +1,111 @@
+"""Exact contours, axis, end and head point in every frame, from poses alone: no drawing code takes part. float64 NumPy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from data_synth.cameras import Camera
+from data_synth.contours import front_point, to_image, view_cylinder, visible_interval
+from data_synth.kinematics import Array
+from data_synth.world import World
+
+POLYLINE_POINTS = 64
+"""Points of each contour in raw pixels, where distortion bends it."""
+SHORTEST_VISIBLE_MM = 5.0
+"""A shaft of which less is in the picture counts as not visible."""
+
+
+@dataclass(frozen=True)
+class SideTruth:
+    """What one camera sees of the instrument in N frames; `xy` is normalised undistorted, `uv` raw pixels. NaN where not visible.
+
+    Edge 0 is on the left of somebody who walks in the picture from the RCM to the tip; of two points the RCM side comes first.
+
+    Attributes:
+        camera_T_rcm: (N, 4, 4) true pose of the RCM frame.
+        camera_p_rcm: (N, 3) its origin, on the axis, mm.
+        camera_v_axis: (N, 3) unit direction of the axis.
+        s_end_mm: (N,) true coordinate of the shaft's end along the axis.
+        n_contour: (N, 2, 3) unit normals of the two contour planes.
+        n_axis: (N, 3) unit normal of the axis plane.
+        contour_xy: (N, 2, 2, 2) first and last visible point of each edge.
+        contour_uv: (N, 2, P, 2) points along each visible edge.
+        axis_xy: (N, 2, 2) first and last visible point of the axis.
+        end_xy: (N, 2) projection of the end circle's centre.
+        end_uv: (N, 2) the same in raw pixels.
+        end_front_xy: (N, 2) where the visible rim of the end crosses the axis' line.
+        end_front_uv: (N, 2) the same in raw pixels.
+        head_xy: (N, 2) projection of the head point.
+        head_uv: (N, 2) the same in raw pixels.
+        visible: (N,) whether enough of the shaft is in the picture.
+        end_visible: (N,) whether the shaft's end is.
+    """
+
+    camera_T_rcm: Array
+    camera_p_rcm: Array
+    camera_v_axis: Array
+    s_end_mm: Array
+    n_contour: Array
+    n_axis: Array
+    contour_xy: Array
+    contour_uv: Array
+    axis_xy: Array
+    end_xy: Array
+    end_uv: Array
+    end_front_xy: Array
+    end_front_uv: Array
+    head_xy: Array
+    head_uv: Array
+    visible: Array
+    end_visible: Array
+
+    def arrays(self) -> dict[str, Array]:
+        """All arrays by name."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+
+def side_truth(world: World, side: str) -> SideTruth:
+    """Truth of one camera over all frames."""
+    camera = world.cameras[side]
+    frames = np.arange(len(world.frame_times_s))
+    shaft, camera_T_rcm = world.shaft(side, frames, world.frame_times_s)
+    p, v, radius = shaft.camera_p_rcm, shaft.camera_v_axis, shaft.radius_mm
+    view = view_cylinder(p, v, radius)
+    low, high = visible_interval(p, v, 0.0, shaft.s_end_mm, camera.bounds())
+    visible = high - low > SHORTEST_VISIBLE_MM
+    end = shaft.axis_point(shaft.s_end_mm)
+    end_visible = visible & (high >= shaft.s_end_mm) & _inside(camera, camera.project(end))
+    low, high = np.where(visible, low, np.nan), np.where(visible, high, np.nan)
+    s = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, POLYLINE_POINTS)
+    axis = p[:, None] + s[..., None] * v[:, None]  # (N, P, 3)
+    contact = axis[:, :, None] + np.array([-radius, radius])[:, None] * view.n_contour[:, None]
+    edges = np.moveaxis(contact, 1, 2)  # (N, 2, P, 3)
+    contour_xy = to_image(edges)
+    end = np.where(end_visible[:, None], end, np.nan)
+    front = front_point(end, view, radius)
+    return SideTruth(
+        camera_T_rcm=camera_T_rcm,
+        camera_p_rcm=p,
+        camera_v_axis=v,
+        s_end_mm=shaft.s_end_mm,
+        n_contour=view.n_contour,
+        n_axis=view.n_axis,
+        contour_xy=contour_xy[:, :, [0, -1]],
+        contour_uv=camera.pixels(contour_xy),
+        axis_xy=to_image(axis[:, [0, -1]]),
+        end_xy=to_image(end),
+        end_uv=camera.project(end),
+        end_front_xy=to_image(front),
+        end_front_uv=camera.project(front),
+        head_xy=to_image(shaft.camera_p_head),
+        head_uv=camera.project(shaft.camera_p_head),
+        visible=visible,
+        end_visible=end_visible,
+    )
+
+
+def _inside(camera: Camera, uv: Array) -> Array:
+    u, v = np.nan_to_num(uv[..., 0], nan=-1e9), np.nan_to_num(uv[..., 1], nan=-1e9)
+    return (u >= -0.5) & (v >= -0.5) & (u <= camera.width - 0.5) & (v <= camera.height - 0.5)

@@ -1,0 +1,89 @@
+"""Everything that is true of one synthetic recording: scene, cameras, motion, and the poses at any time. float64 NumPy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from data_synth.cameras import Camera, build_camera
+from data_synth.kinematics import Array, pose_noise, rigid_inverse
+from data_synth.motion import JointPath, plan_path
+from data_synth.scene import Scene, ShaftInCamera, build_scene, poses_at, shaft_in_camera
+from data_synth.settings import SynthConfig
+
+SIDES = ("right", "left")
+VIEW_MARGIN = 0.04
+"""A point counts as comfortably in view this far (normalised units) inside the picture's border."""
+
+
+@dataclass(frozen=True)
+class World:
+    """The truth of a recording with N frames.
+
+    Attributes:
+        scene: arms and fixed transforms.
+        cameras: by side, "right" and unless monocular "left".
+        path: joint readings at any time.
+        frame_times_s: (N,).
+        rcm_noise: (N, 4, 4) what right-multiplies the kinematics' pose of the RCM frame to give the one that is seen.
+    """
+
+    config: SynthConfig
+    scene: Scene
+    cameras: dict[str, Camera]
+    path: JointPath
+    frame_times_s: Array
+    rcm_noise: Array
+
+    def camera_T_camera_right(self, side: str) -> Array:
+        """Pose (4, 4) of the right camera in a camera."""
+        return np.eye(4) if side == "right" else self.scene.camera_left_T_camera_right
+
+    def base_T_camera(self, side: str, times_s: Array) -> Array:
+        """Pose (..., 4, 4) of a camera at times (...)."""
+        base_T_arm = self.scene.laparoscope.tool(self.path.at(times_s)[0])
+        base_T_camera_right = base_T_arm @ rigid_inverse(self.scene.camera_right_T_arm)
+        return base_T_camera_right @ rigid_inverse(self.camera_T_camera_right(side))
+
+    def shaft(self, side: str, frames: Array, times_s: Array) -> tuple[ShaftInCamera, Array]:
+        """The instrument in a camera, and camera_T_rcm (..., 4, 4), at times (...); `frames` (...) chooses the noise of the pose."""
+        laparoscope, instrument = self.path.at(times_s)
+        poses = poses_at(self.scene, laparoscope, instrument)
+        camera_right_T_rcm = self.scene.camera_right_T_arm @ poses.arm_T_rcm @ self.rcm_noise[frames]
+        camera_T_rcm = self.camera_T_camera_right(side) @ camera_right_T_rcm
+        return shaft_in_camera(self.scene, camera_T_rcm, poses), camera_T_rcm
+
+
+def build_world(config: SynthConfig) -> World:
+    """World of a configuration; the same seed gives the same world."""
+    generator = np.random.default_rng([config.seed, 0])
+    scene = build_scene(config.scene)
+    cameras = {"right": build_camera(config.camera, config.camera.right)}
+    if config.camera.left is not None:
+        cameras["left"] = build_camera(config.camera, config.camera.left)
+    camera_T_camera_right = {"right": np.eye(4), "left": scene.camera_left_T_camera_right}
+
+    def in_view(laparoscope: Array, instrument: Array) -> Array:
+        poses = poses_at(scene, laparoscope, instrument)
+        good = np.ones(len(laparoscope), dtype=bool)
+        for side, camera in cameras.items():
+            camera_T_rcm = camera_T_camera_right[side] @ scene.camera_right_T_arm @ poses.arm_T_rcm
+            shaft = shaft_in_camera(scene, camera_T_rcm, poses)
+            for point in (shaft.camera_p_head, shaft.axis_point(shaft.s_end_mm)):
+                good &= comfortably_in_view(camera, point)
+        return good
+
+    path, times = plan_path(config.motion, scene, config.motions, generator, in_view)
+    sigma_rad = float(np.deg2rad(config.noise.kinematics_deg))
+    rcm_noise = pose_noise(generator, (config.motions,), sigma_rad, config.noise.kinematics_mm)
+    return World(config, scene, cameras, path, times, rcm_noise)
+
+
+def comfortably_in_view(camera: Camera, p: Array) -> Array:
+    """Whether points (..., 3) are inside the picture with a margin."""
+    x_min, y_min, x_max, y_max = camera.bounds()
+    z = np.maximum(p[..., 2], 1e-6)
+    x, y = p[..., 0] / z, p[..., 1] / z
+    inside_x = (x > x_min + VIEW_MARGIN) & (x < x_max - VIEW_MARGIN)
+    return (p[..., 2] > 10.0) & inside_x & (y > y_min + VIEW_MARGIN) & (y < y_max - VIEW_MARGIN)

@@ -1,0 +1,228 @@
+"""Write a synthetic recording with its truth: a folder that appears complete or not at all."""
+
+from __future__ import annotations
+
+import csv
+import os
+import shutil
+from collections.abc import Callable, Iterable, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import yaml
+from av.video.stream import VideoStream
+
+from data_synth.kinematics import Array, pose_noise, rigid_inverse
+from data_synth.motion import log_times
+from data_synth.presets import config_to_dict
+from data_synth.render import Renderer
+from data_synth.settings import OutputSettings, SynthConfig
+from data_synth.truth import SideTruth, side_truth
+from data_synth.world import World, build_world
+
+BATCH = 4
+"""Frames drawn at a time."""
+
+Progress = Callable[[int, int], None]
+
+
+def write_recording(
+    path: str | Path,
+    config: SynthConfig | None = None,
+    *,
+    device: str = "cpu",
+    overwrite: bool = False,
+    on_progress: Progress | None = None,
+) -> Path:
+    """Render a recording into a new folder, with ground_truth.yaml and truth.npz.
+
+    The folder is made under a temporary name beside its place and renamed when complete; an interrupted run leaves nothing.
+
+    Args:
+        path: folder to make.
+        config: what to render; the defaults when None.
+        device: torch device that draws.
+        overwrite: replace a recording that is already there.
+        on_progress: called with (frames done, frames in all), a stereo pair counting once.
+    Returns:
+        the folder.
+    Raises:
+        FileExistsError: the path exists and `overwrite` is False, or it is something else than a recording.
+    """
+    config = config or SynthConfig()
+    target = Path(path)
+    if target.exists() and not (overwrite and (target / "recording.yaml").is_file()):
+        raise FileExistsError(f"{target}: expected a path that does not exist")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = target.parent / f".{target.name}.partial-{os.getpid()}"
+    partial.mkdir()
+    try:
+        world = build_world(config)
+        truths = {side: side_truth(world, side) for side in world.cameras}
+        _write_tables(partial, world, truths)
+        _write_pictures(partial, world, device, on_progress or (lambda done, total: None))
+        if target.exists():
+            shutil.rmtree(target)
+        partial.rename(target)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return target
+
+
+def _write_tables(folder: Path, world: World, truths: dict[str, SideTruth]) -> None:
+    """Everything but the pictures."""
+    config, scene = world.config, world.scene
+    generator = np.random.default_rng([config.seed, 3])
+    logged = config.motion.laparoscope != "unlogged"
+    video = config.output.pictures == "video"
+    recording = {"format": "rmis-calib/1", "robot": "robot.yaml", "stereo": "stereo.yaml"}
+    recording |= {side: f"{side}.mp4" if video else side for side in world.cameras}
+    recording |= {"joints": "joints.csv", "frame_times": "frame_times.csv"}
+    recording |= {"laparoscope_arm": "laparoscope" if logged else None, "instrument_arm": "instrument"}
+    recording |= {"shaft_diameter_mm": config.scene.shaft_diameter_mm + config.noise.shaft_diameter_error_mm}
+    _write_yaml(folder / "recording.yaml", recording)
+    _write_yaml(folder / "robot.yaml", scene.robot_dict("synthetic-rcm-3x3", laparoscope=logged))
+    _write_yaml(folder / "stereo.yaml", _stereo(world, generator))
+    header, rows = _joint_log(world, logged, generator)
+    _write_csv(folder / "joints.csv", header, rows)
+    times = ((i, _text(t)) for i, t in enumerate(world.frame_times_s))
+    _write_csv(folder / "frame_times.csv", ["frame", "timestamp_s"], times)
+    _write_head_points(folder / "head_points.csv", world, truths, generator)
+    _write_yaml(folder / "ground_truth.yaml", ground_truth(world))
+    arrays = {f"{side}_{key}": value for side, truth in truths.items() for key, value in truth.arrays().items()}
+    np.savez_compressed(folder / "truth.npz", frame_times_s=world.frame_times_s, **arrays)
+
+
+def ground_truth(world: World) -> dict[str, Any]:
+    """The content of ground_truth.yaml; per-frame truth is in truth.npz."""
+    scene, config = world.scene, world.config
+    camera_right_T_arm = scene.camera_right_T_arm
+    if config.motion.laparoscope == "unlogged":
+        camera_right_T_arm = rigid_inverse(world.base_T_camera("right", world.frame_times_s[0]))
+    return {
+        "camera_right_T_arm": camera_right_T_arm.tolist(),
+        "camera_left_T_camera_right": scene.camera_left_T_camera_right.tolist(),
+        "shaft_diameter_mm": 2.0 * scene.shaft_radius_mm,
+        "shaft_end_offset_mm": scene.shaft_end_offset_mm,
+        "frames": "truth.npz",
+        "config": config_to_dict(config),
+    }
+
+
+def _stereo(world: World, generator: np.random.Generator) -> dict[str, Any]:
+    """The content of stereo.yaml; the extrinsics carry the error of the calibration that made them."""
+    noise = world.config.noise
+    error = pose_noise(generator, (), float(np.deg2rad(noise.stereo_deg)), noise.stereo_mm)
+    camera = world.config.camera
+    content: dict[str, Any] = {"image_size": [camera.width_px, camera.height_px]}
+    content |= {side: view.to_dict() for side, view in world.cameras.items()}
+    if "left" in world.cameras:
+        content["camera_left_T_camera_right"] = (world.scene.camera_left_T_camera_right @ error).tolist()
+    return content
+
+
+def _joint_log(world: World, logged: bool, generator: np.random.Generator) -> tuple[list[str], Iterable[Sequence[str]]]:
+    """Header and rows of joints.csv."""
+    noise = world.config.noise
+    times = log_times(world.frame_times_s, world.config.motion.joint_rate_hz)
+    laparoscope, instrument = world.path.at(times)
+    arms = {"laparoscope": (world.scene.laparoscope, laparoscope)} if logged else {}
+    arms |= {"instrument": (world.scene.instrument, instrument)}
+    columns = [f"{name}.{joint.column}" for name, (arm, _) in arms.items() for joint in arm.joints]
+    readings = np.concatenate([values for _, values in arms.values()], axis=-1)
+    sigma = [np.deg2rad(noise.joint_reading_deg) if c.endswith("_rad") else noise.joint_reading_mm for c in columns]
+    readings = readings + sigma * generator.standard_normal(readings.shape)
+    table = np.concatenate([times[:, None], readings], axis=-1)
+    return ["timestamp_s", *columns], ([_text(value) for value in row] for row in table)
+
+
+def _write_head_points(path: Path, world: World, truths: dict[str, SideTruth], generator: np.random.Generator) -> None:
+    """Head points with the noise of a label, in frames where every camera sees them."""
+    uv = np.concatenate([truth.head_uv for truth in truths.values()], axis=-1)
+    camera = world.config.camera
+    limit = np.tile([camera.width_px - 1.0, camera.height_px - 1.0], len(truths))
+    seen = ((uv >= 0.0) & (uv <= limit)).all(-1)
+    uv = np.clip(uv + world.config.noise.head_point_px * generator.standard_normal(uv.shape), 0.0, limit)
+    header = ["frame"] + [f"{axis}_{side}_px" for side in truths for axis in "uv"]
+    _write_csv(path, header, ([str(i), *(f"{x:.3f}" for x in uv[i])] for i in np.flatnonzero(seen)))
+
+
+def _write_pictures(folder: Path, world: World, device: str, on_progress: Progress) -> None:
+    renderer, total = Renderer(world, device), len(world.frame_times_s)
+    make = _VideoWriter if world.config.output.pictures == "video" else _ImageWriter
+    rate = _frame_rate(world)
+    writers = {side: make(folder / side, world.config.output, renderer.size, rate) for side in world.cameras}
+    try:
+        for first in range(0, total, BATCH):
+            frames = np.arange(first, min(first + BATCH, total))
+            for side, writer in writers.items():
+                pictures = renderer.render(side, frames).permute(0, 2, 3, 1).contiguous().cpu().numpy()
+                for picture in pictures:
+                    writer.add(picture)
+            on_progress(int(frames[-1]) + 1, total)
+    finally:
+        for writer in writers.values():
+            writer.close()
+
+
+def _frame_rate(world: World) -> Fraction:
+    motion = world.config.motion
+    rate = motion.frame_rate_hz if motion.kind == "smooth" else 1.0 / motion.stop_period_s
+    return Fraction(rate).limit_denominator(1001)
+
+
+class _VideoWriter:
+    """H.264 with full chroma resolution, so that coloured edges stay where they are."""
+
+    def __init__(self, path: Path, settings: OutputSettings, size: tuple[int, int], rate: Fraction) -> None:
+        self._container = av.open(str(path.with_suffix(".mp4")), "w")
+        options = {"crf": str(settings.crf), "preset": "veryfast"}
+        self._stream: VideoStream = self._container.add_stream("libx264", rate=rate, options=options)
+        self._stream.height, self._stream.width = size
+        self._stream.pix_fmt = "yuv444p"
+
+    def add(self, picture: np.ndarray) -> None:
+        frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+        self._container.mux(self._stream.encode(frame))
+
+    def close(self) -> None:
+        self._container.mux(self._stream.encode())
+        self._container.close()
+
+
+class _ImageWriter:
+    """PNG files, numbered."""
+
+    def __init__(self, path: Path, settings: OutputSettings, size: tuple[int, int], rate: Fraction) -> None:
+        self._path, self._count = path, 0
+        path.mkdir()
+
+    def add(self, picture: np.ndarray) -> None:
+        frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+        encoder = av.CodecContext.create("png", "w")
+        encoder.width, encoder.height, encoder.pix_fmt = frame.width, frame.height, "rgb24"
+        encoder.time_base = Fraction(1, 1)
+        packets = [bytes(packet) for packet in (*encoder.encode(frame), *encoder.encode(None))]
+        (self._path / f"{self._count:06d}.png").write_bytes(b"".join(packets))
+        self._count += 1
+
+    def close(self) -> None:
+        return
+
+
+def _text(value: float) -> str:
+    return f"{value:.9f}"
+
+
+def _write_yaml(path: Path, content: dict[str, Any]) -> None:
+    path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+
+
+def _write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(header)
+        writer.writerows(rows)
