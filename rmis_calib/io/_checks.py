@@ -1,0 +1,36 @@
+"""Checks on arrays that several files share."""
+
+import numpy as np
+
+from rmis_calib.errors import InputError
+
+# The entries of R^T R may differ from the identity by this much: far above the rounding of a printed matrix of seven
+# digits, far below any wrong one.
+ORTHONORMAL_TOLERANCE = 1e-6
+
+
+def check_rigid(matrix: np.ndarray, where: str, error: type[InputError]) -> None:
+    """Refuse what is not a rigid transform.
+
+    Args:
+        matrix: (4, 4) or (N, 4, 4), finite.
+        where: file and key, for the message; the index of the first bad item is added to it.
+        error: class to raise.
+
+    Raises:
+        error: the rotation is not orthonormal or a reflection, or the last row is not 0 0 0 1.
+    """
+    items = matrix.reshape(-1, 4, 4)
+    R = items[:, :3, :3]
+    deviation = np.abs(R.transpose(0, 2, 1) @ R - np.eye(3)).max(axis=(1, 2), initial=0.0)
+    orthonormal = f"an orthonormal rotation (R^T R = I within {ORTHONORMAL_TOLERANCE:g})"
+    checks = (
+        (deviation > ORTHONORMAL_TOLERANCE, orthonormal, lambda i: f"a deviation of {deviation[i]:.3g}"),
+        (np.linalg.det(R) < 0, "a rotation (determinant +1)", lambda i: "a reflection (determinant -1)"),
+        ((items[:, 3] != [0, 0, 0, 1]).any(axis=1), "a last row of 0, 0, 0, 1", lambda i: items[i, 3].tolist()),
+    )
+    for bad, expected, found in checks:
+        if bad.any():
+            i = int(bad.argmax())
+            place = where if matrix.ndim == 2 else f"{where}[{i}]"
+            raise error(where=place, expected=expected, found=found(i))

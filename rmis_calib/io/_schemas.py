@@ -1,0 +1,158 @@
+"""What may stand in recording.yaml, stereo.yaml and robot.yaml (DESIGN.md 6.1): every key, its type and its range."""
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, model_validator
+
+FORMAT = "rmis-calib/1"
+METRES = "looks like metres; write millimetres"
+DEGREES = "looks like degrees; write radians"
+# A full turn and what rounding may add to it.
+FULL_TURN_RAD = 2 * math.pi * 1.001
+
+# Names become column names of joints.csv, `<arm>.<joint>_rad`: no dot, comma or blank in them.
+Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][A-Za-z0-9_-]*$")]
+FileName = Annotated[str, StringConstraints(min_length=1)]
+Row = Annotated[list[float], Field(min_length=4, max_length=4)]
+Matrix = Annotated[list[Row], Field(min_length=4, max_length=4)]
+Side = Annotated[int, Field(ge=16, le=100_000)]
+
+
+def _not_degrees(value: float) -> float:
+    if abs(value) > FULL_TURN_RAD:
+        raise ValueError(f"{DEGREES}; expected at most one turn, found {value:g}")
+    return value
+
+
+def _shaft_diameter(value: float) -> float:
+    if not 1.0 <= value <= 30.0:
+        hint = f"{METRES}; " if 0 < value < 1.0 else ""
+        raise ValueError(f"{hint}expected a diameter of 1 to 30 mm, found {value:g}")
+    return value
+
+
+Angle = Annotated[float, AfterValidator(_not_degrees)]
+ShaftDiameter = Annotated[float, AfterValidator(_shaft_diameter)]
+
+
+class Schema(BaseModel):
+    """Nothing unknown, nothing converted, nothing infinite."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+
+
+class RecordingSchema(Schema):
+    format: Literal["rmis-calib/1"]
+    robot: FileName
+    stereo: FileName
+    right: FileName
+    left: FileName | None = None
+    joints: FileName
+    frame_times: FileName | None = None
+    laparoscope_arm: Name | None
+    instrument_arm: Name
+    shaft_diameter_mm: ShaftDiameter
+    clock_offset_s: float = 0.0
+
+    @model_validator(mode="after")
+    def _two_arms(self) -> "RecordingSchema":
+        if self.laparoscope_arm == self.instrument_arm:
+            raise ValueError(f"expected two different arms, found {self.instrument_arm!r} as laparoscope and instrument")
+        return self
+
+
+class CameraSchema(Schema):
+    fx: Annotated[float, Field(gt=0)]
+    fy: Annotated[float, Field(gt=0)]
+    cx: float
+    cy: float
+    distortion: Annotated[list[float], Field(min_length=5, max_length=5)]
+
+
+class StereoSchema(Schema):
+    image_size: Annotated[list[Side], Field(min_length=2, max_length=2)]
+    right: CameraSchema
+    left: CameraSchema | None = None
+    camera_left_T_camera_right: Matrix | None = None
+
+    @model_validator(mode="after")
+    def _left_with_extrinsics(self) -> "StereoSchema":
+        if (self.left is None) != (self.camera_left_T_camera_right is None):
+            present = "left" if self.camera_left_T_camera_right is None else "camera_left_T_camera_right"
+            raise ValueError(f"expected both left and camera_left_T_camera_right or neither, found only {present}")
+        return self
+
+
+class JointSchema(Schema):
+    name: Name
+    type: Literal["revolute", "prismatic"]
+    alpha_rad: Angle
+    a_mm: float
+    theta_rad: Angle
+    d_mm: float
+    offset: float
+    min: float | None = None
+    max: float | None = None
+
+    @model_validator(mode="after")
+    def _sane(self) -> "JointSchema":
+        if (self.min is None) != (self.max is None):
+            raise ValueError("expected both min and max or neither, found one")
+        if self.min is not None and self.max is not None and self.min >= self.max:
+            raise ValueError(f"expected min < max, found {self.min:g} and {self.max:g}")
+        readings = [self.offset, *(limit for limit in (self.min, self.max) if limit is not None)]
+        if self.type == "revolute" and max(map(abs, readings)) > FULL_TURN_RAD:
+            raise ValueError(f"{DEGREES}; expected offset, min and max within one turn, found {readings}")
+        if self.type == "prismatic" and 0 < max(map(abs, readings[1:]), default=0.0) < 1.0:
+            raise ValueError(f"{METRES}; expected limits in mm, found {readings[1:]}")
+        return self
+
+
+class HeadPointSchema(Schema):
+    frame: Annotated[int, Field(ge=0)]
+    xyz_mm: Annotated[list[float], Field(min_length=3, max_length=3)]
+
+
+class ArmSchema(Schema):
+    base_T_arm_base: Matrix
+    joints: Annotated[list[JointSchema], Field(min_length=1)]
+    end_T_tool: Matrix | None = None
+    rcm_frame: Annotated[int, Field(ge=0)] | None = None
+    shaft_frame: Annotated[int, Field(ge=0)] | None = None
+    head_point: HeadPointSchema | None = None
+
+    @model_validator(mode="after")
+    def _sane(self) -> "ArmSchema":
+        names = [joint.name for joint in self.joints]
+        if len(set(names)) < len(names):
+            raise ValueError(f"expected joint names that differ, found {', '.join(names)}")
+        lengths = [abs(length) for joint in self.joints for length in (joint.a_mm, joint.d_mm)]
+        lengths += [abs(joint.offset) for joint in self.joints if joint.type == "prismatic"]
+        if 0 < max(lengths) < 1.0:
+            raise ValueError(f"{METRES}; expected DH lengths in mm, found none above {max(lengths):g}")
+        self._check_shaft_keys()
+        return self
+
+    def _check_shaft_keys(self) -> None:
+        frames = {"rcm_frame": self.rcm_frame, "shaft_frame": self.shaft_frame, "head_point": self.head_point}
+        given = [key for key, value in frames.items() if value is not None]
+        if given and len(given) < 3:
+            missing = ", ".join(key for key in frames if key not in given)
+            raise ValueError(f"expected rcm_frame, shaft_frame and head_point together, found no {missing}")
+        if self.rcm_frame is None or self.shaft_frame is None or self.head_point is None:
+            return
+        for key, frame in (("rcm_frame", self.rcm_frame), ("head_point.frame", self.head_point.frame)):
+            if frame > len(self.joints):
+                raise ValueError(f"expected {key} from 0 to {len(self.joints)} (the joints), found {frame}")
+        if not self.shaft_frame <= self.head_point.frame:
+            expected = f"expected shaft_frame at most head_point.frame ({self.head_point.frame})"
+            raise ValueError(f"{expected}, found {self.shaft_frame}")
+
+
+class RobotSchema(Schema):
+    name: Annotated[str, StringConstraints(min_length=1)]
+    dh_convention: Literal["modified", "standard"]
+    arms: Annotated[dict[Name, ArmSchema], Field(min_length=1)]
+
+

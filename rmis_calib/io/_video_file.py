@@ -1,0 +1,215 @@
+"""A video file as a source of frames: counted and timed by its packets, decoded by PyAV, checked against each other."""
+
+from bisect import bisect_right
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+from av.video.frame import VideoFrame
+
+from rmis_calib.errors import VideoError
+
+
+@dataclass(frozen=True)
+class _Index:
+    """What the packets say, without decoding: display times in units of the stream's time base, sorted."""
+
+    count: int
+    pts: list[int]
+    key_pts: list[int]
+    promised: int
+    """Packets that the container claims to hold; 0 where it claims nothing."""
+    present: int
+    is_damaged: bool
+
+
+class VideoReader:
+    """Frames of a video file in the order of their display.
+
+    Opening reads every packet without decoding it: an exact count, an exact time of each frame, and the news of a file
+    that was cut off. A cut that leaves whole packets in a format without an index or a duration (MPEG-TS, raw H.264)
+    shows only against frame_times.csv.
+
+    Raises:
+        VideoError: the file is empty, not a video, or truncated.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.count = 0
+        if path.stat().st_size == 0:
+            raise VideoError(where=str(path), expected="a video", found="an empty file (0 bytes)")
+        with self._open() as (container, stream):
+            self.size: tuple[int, int] = (stream.codec_context.height, stream.codec_context.width)
+            self._rate = stream.average_rate or stream.guessed_rate
+            self._time_base = stream.time_base
+            index = _read_index(container, stream)
+            hides_frames = _has_hidden_packets(container, stream)
+        if min(self.size) <= 0:
+            raise VideoError(where=str(path), expected="a video with pictures", found="none that can be decoded")
+        if index.is_damaged or not index.count or index.promised > index.present:
+            raise self._truncated(index.promised, index.present)
+        self.count, self._pts, self._key_pts = index.count, index.pts, index.key_pts
+        if hides_frames:
+            decoded = [frame.pts for frame in self._decode()]
+            self.count, self._pts = len(decoded), [pts for pts in decoded if pts is not None]
+
+    @property
+    def times_s(self) -> np.ndarray | None:
+        """Time of each frame after the first, (N,); from the container's time stamps, else index / rate."""
+        if self._has_pts and self._time_base is not None:
+            pts = np.array(self._pts, dtype=np.int64)
+            return (pts - pts[0]) * float(self._time_base)
+        return np.arange(self.count) / float(self._rate) if self._rate else None
+
+    @property
+    def _has_pts(self) -> bool:
+        return len(set(self._pts)) == self.count
+
+    def read_all(self) -> Generator[np.ndarray, None, None]:
+        """Every frame, (H, W, 3) uint8 RGB.
+
+        Raises:
+            VideoError: a frame cannot be decoded, or their number is not the one counted at opening.
+        """
+        number = 0
+        for frame in self._decode():
+            yield self._pixels(frame, number)
+            number += 1
+        if number != self.count:
+            raise self._truncated(self.count, number)
+
+    def read(self, indices: Sequence[int]) -> Iterator[np.ndarray]:
+        """Some frames; `indices` increase.
+
+        Raises:
+            VideoError: a frame cannot be decoded or does not come.
+        """
+        if not self._has_pts:
+            wanted = set(indices)
+            yield from (image for number, image in enumerate(self.read_all()) if number in wanted)
+            return
+        with self._open() as (container, stream):
+            frames: Iterator[VideoFrame] = iter(())
+            reached = -1
+            for index in indices:
+                key = self._key_before(index)
+                if key > reached:
+                    frames = self._frames_from(container, stream, key)
+                frame = next((frame for frame in frames if self._index_of(frame) >= index), None)
+                if frame is None or self._index_of(frame) != index:
+                    raise VideoError("truncated or damaged video", where=f"{self.path} frame {index}")
+                reached = index
+                yield self._pixels(frame, index)
+
+    def _key_before(self, index: int) -> int:
+        """Index of the last frame at or before `index` where decoding can start."""
+        place = bisect_right(self._key_pts, self._pts[index])
+        return bisect_right(self._pts, self._key_pts[place - 1]) - 1 if place else 0
+
+    def _frames_from(self, container: Any, stream: Any, key: int) -> Iterator[VideoFrame]:
+        """Frames from `key` or from a little before it."""
+        container.seek(self._pts[key], stream=stream)
+        frames = self._guard(container.decode(stream))
+        first = next(frames, None)
+        if first is None or self._index_of(first) > key:
+            # Some containers seek by decoding time and land one key frame late: start over.
+            container.seek(min(self._pts[0], 0), stream=stream)
+            return self._guard(container.decode(stream))
+        return chain([first], frames)
+
+    def _index_of(self, frame: VideoFrame) -> int:
+        """Number of a frame by its time stamp; -1 for one that belongs before the first."""
+        return -1 if frame.pts is None else bisect_right(self._pts, frame.pts) - 1
+
+    def _decode(self) -> Iterator[VideoFrame]:
+        with self._open() as (container, stream):
+            yield from self._guard(container.decode(stream))
+
+    def _guard(self, frames: Iterator[VideoFrame]) -> Iterator[VideoFrame]:
+        """The same frames, with the decoder's complaints as `VideoError`."""
+        number = 0
+        while True:
+            try:
+                frame = next(frames, None)
+            except av.FFmpegError as error:
+                found = f"an error after {number} frames ({error.strerror})"
+                raise VideoError(where=str(self.path), expected=f"{self.count} frames", found=found) from error
+            if frame is None:
+                return
+            number += 1
+            yield frame
+
+    def _pixels(self, frame: VideoFrame, number: int) -> np.ndarray:
+        if frame.is_corrupt:
+            raise VideoError(where=f"{self.path} frame {number}", expected="a whole picture", found="a damaged one")
+        if (frame.height, frame.width) != self.size:
+            expected = f"{self.size[1]} x {self.size[0]} px as before"
+            found = f"{frame.width} x {frame.height}"
+            raise VideoError(where=f"{self.path} frame {number}", expected=expected, found=found)
+        return frame.to_ndarray(format="rgb24")
+
+    def _truncated(self, expected: int, found: int) -> VideoError:
+        promise = f"{expected} frames" if expected > found else "whole frames"
+        found_text = f"{found} frames" if expected > found else f"a cut after {max(found - 1, 0)} frames"
+        return VideoError("truncated or damaged video", where=str(self.path), expected=promise, found=found_text)
+
+    @contextmanager
+    def _open(self) -> Iterator[tuple[Any, Any]]:
+        try:
+            with av.open(str(self.path), metadata_errors="ignore") as container:
+                if len(container.streams.video) != 1:
+                    found = f"{len(container.streams.video)}"
+                    raise VideoError(where=str(self.path), expected="one video stream", found=found)
+                stream = container.streams.video[0]
+                stream.thread_type = "AUTO"
+                yield container, stream
+        except av.FFmpegError as error:
+            raise VideoError(where=str(self.path), expected="a complete video", found=error.strerror) from error
+
+
+def _read_index(container: Any, stream: Any) -> _Index:
+    pts, key_pts = [], []
+    end = count = present = 0
+    is_damaged = False
+    for packet in container.demux(stream):
+        if not packet.size:  # the flush at the end
+            continue
+        present += 1
+        is_damaged |= packet.is_corrupt
+        if packet.is_discard:  # cut away by an edit list: decoded, never shown
+            continue
+        count += 1
+        if packet.pts is not None:
+            pts.append(packet.pts)
+            end = max(end, packet.pts + (packet.duration or 0))
+            if packet.is_keyframe:
+                key_pts.append(packet.pts)
+    promised = _promised_count(stream, present, float(end * stream.time_base)) if pts else stream.frames
+    return _Index(count, sorted(pts), sorted(key_pts), promised, present, is_damaged)
+
+
+def _promised_count(stream: Any, present: int, end_s: float) -> int:
+    """Number of packets that the container claims to hold; 0 where it claims nothing."""
+    declared = stream.metadata.get("NUMBER_OF_FRAMES", "")
+    if stream.frames or declared.isdigit():
+        return stream.frames or int(declared)
+    # Matroska states a duration, "HH:MM:SS.fraction", and no count.
+    parts = stream.metadata.get("DURATION", "").split(":")
+    if len(parts) != 3 or not stream.average_rate:
+        return 0
+    hours, minutes, seconds = (float(part) for part in parts)
+    missing = round((hours * 3600 + minutes * 60 + seconds - end_s) * float(stream.average_rate))
+    # The duration is rounded, and may or may not count the time that the last frame is shown.
+    return present + missing if missing >= 2 else 0
+
+
+def _has_hidden_packets(container: Any, stream: Any) -> bool:
+    """Whether packets and pictures may differ in number: hidden reference frames of VP8, packed B-frames in AVI."""
+    codec = stream.codec_context.name
+    return codec.startswith(("vp8", "libvpx")) or (codec == "mpeg4" and "avi" in container.format.name)

@@ -1,0 +1,122 @@
+"""Shipped configuration files by name, and YAML read the way people write numbers."""
+
+import difflib
+import re
+from collections.abc import Hashable
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from rmis_calib.errors import ConfigError, FileError, InputError
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def config_names(kind: str) -> list[str]:
+    """Names of the shipped files `configs/<kind>/<name>.yaml`, sorted."""
+    return sorted(path.stem for folder in _config_folders(kind) for path in folder.glob("*.yaml"))
+
+
+def config_path(kind: str, name: str, error: type[InputError] = ConfigError) -> Path:
+    """File of a shipped configuration, in the source tree or in the installed package.
+
+    Raises:
+        ConfigError: (or the `error` given) no such name; lists the shipped ones.
+    """
+    known = config_names(kind)
+    if name in known:
+        return next(path for folder in _config_folders(kind) if (path := folder / f"{name}.yaml").is_file())
+    found = f"{name!r}{did_you_mean(name, known)}"
+    raise error(where=f"{kind} preset", expected=f"one of {', '.join(known) or '(none shipped)'}", found=found)
+
+
+def load_yaml(path: str | Path, error: type[InputError] = ConfigError) -> dict[str, Any]:
+    """The mapping in a YAML file: safe tags only, YAML 1.2 scalars (`1e-3` is a number, `no` is a word), no key twice.
+
+    Raises:
+        FileError: the file is absent or unreadable.
+        ConfigError: (or the `error` given) it is not YAML, or not a mapping; names the line.
+    """
+    raw = read_bytes(path)
+    try:
+        # Thousands of nested brackets end in a recursion error, thousands of digits in a value error.
+        value = yaml.load(raw.decode("utf-8-sig"), Loader=_Yaml12Loader)
+    except (yaml.YAMLError, ValueError, RecursionError) as problem:
+        raise _yaml_error(path, problem, error) from problem
+    if not isinstance(value, dict):
+        found = "an empty file" if value is None else type(value).__name__
+        raise error(where=str(path), expected="a mapping of keys to values", found=found)
+    return value
+
+
+def read_bytes(path: str | Path) -> bytes:
+    """Content of a file.
+
+    Raises:
+        FileError: it is absent, a folder or unreadable.
+    """
+    try:
+        return Path(path).read_bytes()
+    except OSError as problem:
+        found = "nothing there" if isinstance(problem, FileNotFoundError) else problem.strerror
+        raise FileError(where=str(path), expected="a readable file", found=found) from problem
+
+
+def did_you_mean(word: str, known: list[str]) -> str:
+    """` (did you mean x?)` with the nearest known word, or nothing."""
+    near = difflib.get_close_matches(word, known, n=1)
+    return f" (did you mean {near[0]}?)" if near else ""
+
+
+def _config_folders(kind: str) -> list[Path]:
+    # A wheel carries configs inside the package; a source tree has it beside the package.
+    return [folder for root in (_PACKAGE, _PACKAGE.parent) if (folder := root / "configs" / kind).is_dir()]
+
+
+def _yaml_error(path: str | Path, problem: Exception, error: type[InputError]) -> InputError:
+    if isinstance(problem, yaml.MarkedYAMLError) and problem.problem_mark is not None:
+        place = f"{path} line {problem.problem_mark.line + 1}"
+        return error(where=place, expected="valid YAML", found=problem.problem)
+    if isinstance(problem, UnicodeDecodeError):
+        return error(where=str(path), expected="UTF-8 text", found=f"byte 0x{problem.object[problem.start]:02x}")
+    found = "too many nested brackets" if isinstance(problem, RecursionError) else " ".join(str(problem).split())
+    return error(where=str(path), expected="valid YAML", found=found)
+
+
+class _Yaml12Loader(yaml.CSafeLoader if yaml.__with_libyaml__ else yaml.SafeLoader):
+    """Safe loader with the YAML 1.2 core schema; PyYAML's own is 1.1: `1e-3` a string, `no` false, `1:30` ninety."""
+
+    yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        seen: set[Any] = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            if not isinstance(key, str):
+                raise yaml.constructor.ConstructorError(None, None, f"a key that is not a word: {key!r}", key_node.start_mark)
+            if key in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"key {key!r} is given twice", key_node.start_mark)
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+    def construct_int12(self, node: yaml.ScalarNode) -> int:
+        text = self.construct_scalar(node)
+        return int(text, 0) if text[:2] in ("0o", "0x") else int(text)
+
+    def construct_float12(self, node: yaml.ScalarNode) -> float:
+        return float(self.construct_scalar(node).lower().replace(".inf", "inf").replace(".nan", "nan"))
+
+
+_RESOLVERS = (
+    ("null", r"~|null|Null|NULL|", "~nN\0"),
+    ("bool", r"true|True|TRUE|false|False|FALSE", "tTfF"),
+    ("int", r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+", "-+0123456789"),
+    ("float", r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?", "-+.0123456789"),
+    ("float", r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)", "-+."),
+)
+for _kind, _pattern, _first in _RESOLVERS:
+    _letters = [*_first.replace("\0", ""), *([""] if "\0" in _first else [])]
+    _Yaml12Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_kind}", re.compile(rf"(?:{_pattern})\Z"), _letters)
+_Yaml12Loader.add_constructor("tag:yaml.org,2002:int", _Yaml12Loader.construct_int12)
+_Yaml12Loader.add_constructor("tag:yaml.org,2002:float", _Yaml12Loader.construct_float12)

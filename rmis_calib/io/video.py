@@ -1,0 +1,139 @@
+"""Frames of a video or a folder of images: decoded ahead in a background thread, in bounded memory, onto a device."""
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Int64, UInt8
+from torch import Tensor
+
+from rmis_calib.errors import FileError, InputError, VideoError
+from rmis_calib.io._images import SUFFIXES, ImageReader
+from rmis_calib.io._video_file import VideoReader
+
+# Batches decoded ahead of the consumer: one to hide the decoding behind the detection, one more to ride out a key frame.
+_BATCHES_AHEAD = 2
+
+
+@dataclass(frozen=True, eq=False)
+class FrameBatch:
+    """Consecutive frames on one device."""
+
+    indices: Int64[Tensor, " batch"]
+    """Frame numbers, on the CPU."""
+    images: UInt8[Tensor, "batch 3 height width"]
+    """RGB; channels last in memory, as they are decoded."""
+
+
+class FrameSource:
+    """One camera's frames.
+
+    Attributes:
+        path: the video, folder or image.
+        size: (height, width), px.
+        count: number of frames, exact.
+        times_s: (N,) time of each frame after the first, from the container's time stamps, else index / rate; None for
+            images and for a video that has neither.
+    """
+
+    def __init__(self, reader: VideoReader | ImageReader) -> None:
+        self._reader = reader
+        self.path: Path = reader.path
+        self.size: tuple[int, int] = reader.size
+        self.count: int = reader.count
+        self.times_s: np.ndarray | None = reader.times_s
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __repr__(self) -> str:
+        return f"FrameSource({str(self.path)!r}, {self.count} frames of {self.size[1]} x {self.size[0]} px)"
+
+    def batches(self, batch_size: int, device: torch.device | str = "cpu") -> Iterator[FrameBatch]:
+        """All frames in order, the last batch shorter where it must be.
+
+        A thread decodes ahead; memory holds three batches at most, the consumer's among them. Closing the iterator, or
+        leaving its loop, ends the thread.
+
+        Raises:
+            InputError: `batch_size` is not positive.
+            VideoError: a frame cannot be decoded; raised when the consumer reaches its batch.
+        """
+        if batch_size < 1:
+            raise InputError(where="batch_size", expected="at least 1", found=batch_size)
+        return self._batches(batch_size, torch.device(device))
+
+    def _batches(self, batch_size: int, device: torch.device) -> Iterator[FrameBatch]:
+        frames = self._reader.read_all()
+        executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="rmis-decode")
+        try:
+            # Errors of the thread travel in the futures and are raised by `result`.
+            ahead = deque(executor.submit(_stack, frames, batch_size) for _ in range(_BATCHES_AHEAD))
+            start = 0
+            while (images := ahead.popleft().result()) is not None:
+                ahead.append(executor.submit(_stack, frames, batch_size))
+                yield _to_device(images, start, device)
+                start += len(images)
+        finally:
+            executor.shutdown(wait=True, cancel_futures=True)
+            frames.close()
+
+    def frame(self, index: int) -> UInt8[Tensor, "3 height width"]:
+        """One frame by number, RGB on the CPU.
+
+        Raises:
+            InputError: no such frame.
+            VideoError: it cannot be decoded.
+        """
+        return self.frames([index])[0]
+
+    def frames(self, indices: Sequence[int]) -> UInt8[Tensor, "n 3 height width"]:
+        """Some frames by number, in the order asked for, RGB on the CPU. Decodes from the nearest key frames.
+
+        Raises:
+            InputError: no such frame.
+            VideoError: one cannot be decoded.
+        """
+        wrong = [index for index in indices if not 0 <= index < self.count]
+        if wrong:
+            raise InputError(where=str(self.path), expected=f"a frame of 0 to {self.count - 1}", found=wrong[0])
+        order = sorted(set(indices))
+        found = dict(zip(order, self._reader.read(order), strict=True))
+        images = np.stack([found[index] for index in indices]) if order else np.empty((0, *self.size, 3), np.uint8)
+        return torch.from_numpy(images).permute(0, 3, 1, 2)
+
+
+def open_source(path: str | Path) -> FrameSource:
+    """Frames of a video file, a folder of images sorted by name, or a single image.
+
+    Raises:
+        FileError: nothing is there.
+        VideoError: it is empty, truncated or not what it seems.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileError(where=str(path), expected="a video or a folder of images", found="nothing there")
+    try:
+        is_images = path.is_dir() or path.suffix.lower() in SUFFIXES
+        return FrameSource(ImageReader(path) if is_images else VideoReader(path))
+    except PermissionError as error:
+        raise VideoError(where=str(path), expected="a readable file", found=error.strerror) from error
+
+
+def _stack(frames: Iterator[np.ndarray], batch_size: int) -> np.ndarray | None:
+    batch = list(islice(frames, batch_size))
+    return np.stack(batch) if batch else None
+
+
+def _to_device(images: np.ndarray, start: int, device: torch.device) -> FrameBatch:
+    pixels = torch.from_numpy(images)
+    if device.type == "cuda":
+        # From pinned memory the copy runs beside the kernels of the batch before.
+        pixels = pixels.pin_memory().to(device, non_blocking=True)
+    indices = torch.arange(start, start + len(images))
+    return FrameBatch(indices, pixels.to(device).permute(0, 3, 1, 2))
