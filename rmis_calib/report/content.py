@@ -1,0 +1,254 @@
+"""What the page says, worked out from a result: plain values and words, no markup."""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rmis_calib.geometry.rigid import RigidTransform
+from rmis_calib.report.formatting import UNKNOWN, any_value, finite, fixed, significant
+from rmis_calib.results import STATUS_SENTENCES, CalibrationResult, finite_or_none
+
+AXES = ("x, right", "y, down", "z, forward")
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The first thing to read: `tone` is `ok`, `weak` or `bad`, and chooses colour and icon together."""
+
+    tone: str
+    word: str
+    sentence: str
+
+
+_VERDICTS = {
+    "ok": ("ok", "Trustworthy"),
+    "weak": ("weak", "Weak: do not rely on it"),
+    "unobservable": ("bad", "Not observable: do not use"),
+    "solver_failed": ("bad", "No solution"),
+    "insufficient_data": ("bad", "Not enough data"),
+}
+_OBSERVABILITY_TONES = {"trustworthy": "ok", "weak": "weak", "unobservable": "bad"}
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A rigid transform in print.
+
+    Attributes:
+        name: `dst_T_src`.
+        dst: frame it maps to.
+        src: frame it maps from.
+        rows: 4 x 4 cells.
+        quat_wxyz: four numbers.
+        translation_mm: three numbers.
+        code: the same at full precision, as Python.
+    """
+
+    name: str
+    dst: str
+    src: str
+    rows: tuple[tuple[str, ...], ...]
+    quat_wxyz: tuple[str, ...]
+    translation_mm: tuple[str, ...]
+    code: str
+
+
+@dataclass(frozen=True)
+class AxisRow:
+    """Uncertainty along one axis of the camera: 1 sigma of rotation about it and of translation along it."""
+
+    axis: str
+    rotation_deg: str
+    translation_mm: str
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """1 sigma of the transform: the roots of the traces, the working point, and each axis."""
+
+    rotation_deg: str
+    translation_mm: str
+    working_point_mm: str
+    axes: tuple[AxisRow, ...]
+
+
+@dataclass(frozen=True)
+class Direction:
+    """One eigen-direction of the uncertainty: words, sigma, length of its bar in per cent, and its six components."""
+
+    words: str
+    sigma_mm: str
+    bar_percent: float
+    vector: str
+
+
+@dataclass(frozen=True)
+class Observability:
+    """What the data can and cannot see; `ticks` are (place in per cent, label) of the bars' logarithmic axis."""
+
+    tone: str
+    verdict: str
+    sentences: tuple[str, ...]
+    named_cases: tuple[str, ...]
+    advice: tuple[str, ...]
+    directions: tuple[Direction, ...]
+    ticks: tuple[tuple[float, str], ...]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of a table of names, values and their uncertainty."""
+
+    name: str
+    value: str
+    sigma: str
+    unit: str
+
+
+def verdict(result: CalibrationResult) -> Verdict:
+    """The verdict in a word and a sentence; a status this page does not know counts as bad."""
+    tone, word = _VERDICTS.get(result.status, ("bad", f"Unknown status {result.status}"))
+    return Verdict(tone, word, STATUS_SENTENCES.get(result.status, ""))
+
+
+def pose(name: str, transform: RigidTransform | None) -> Pose | None:
+    """A transform in print, or None where there is none."""
+    if transform is None:
+        return None
+    record = transform.to_dict()
+    matrix = np.asarray(record["matrix"], dtype=float).reshape(4, 4)
+    rows = [(*(fixed(cell, 6) for cell in row[:3]), fixed(row[3], 3)) for row in matrix[:3]]
+    quat = np.asarray(record["quat_wxyz"], dtype=float).reshape(4)
+    translation = np.asarray(record["translation_mm"], dtype=float).reshape(3)
+    return Pose(
+        name=name,
+        dst=str(record["dst"]),
+        src=str(record["src"]),
+        rows=(*rows, ("0", "0", "0", "1")),
+        quat_wxyz=tuple(fixed(value, 6) for value in quat),
+        translation_mm=tuple(fixed(value, 3) for value in translation),
+        code=_code(name, str(record["src"]), str(record["dst"]), matrix, quat),
+    )
+
+
+def _code(name: str, src: str, dst: str, matrix: np.ndarray, quat: np.ndarray) -> str:
+    rows = "\n".join("    [" + ", ".join(f"{cell: .9f}" for cell in row) + "]," for row in matrix)
+    return (
+        f"# maps coordinates in {src} to coordinates in {dst}; translation in mm\n"
+        f"{name} = [\n{rows}\n]\n"
+        f"quat_wxyz = [{', '.join(f'{value:.9f}' for value in quat)}]\n"
+        f"translation_mm = [{', '.join(f'{value:.6f}' for value in matrix[:3, 3])}]"
+    )
+
+
+def uncertainty(result: CalibrationResult) -> Uncertainty:
+    """The covariance in degrees and millimetres; "unknown" wherever it is absent or not a covariance."""
+    covariance = np.full((6, 6), math.nan) if result.covariance is None else np.asarray(result.covariance, dtype=float)
+    variances = np.diag(covariance)
+    variances = np.where(variances >= 0.0, variances, np.nan)
+    sigmas = np.sqrt(variances)
+    degrees = np.degrees(sigmas[:3])
+    return Uncertainty(
+        rotation_deg=significant(math.sqrt(np.sum(degrees**2)), 2),
+        translation_mm=significant(math.sqrt(np.sum(variances[3:])), 2),
+        working_point_mm=significant(result.observability.get("working_point_sigma_mm"), 2),
+        axes=tuple(
+            AxisRow(axis, significant(degrees[index], 2), significant(sigmas[3 + index], 2))
+            for index, axis in enumerate(AXES)
+        ),
+    )
+
+
+def observability(raw: Mapping[str, Any]) -> Observability:
+    """Observability in print, tolerant of missing keys; weakest direction first."""
+    found = [item for item in raw.get("directions") or () if isinstance(item, Mapping)]
+    sigmas = [finite(item.get("sigma_at_working_point_mm")) for item in found]
+    size = [math.inf if sigma is None else sigma for sigma in sigmas]
+    order = sorted(range(len(found)), key=lambda index: -size[index])
+    known = [sigma for sigma in sigmas if sigma is not None and sigma > 0.0]
+    low = math.floor(math.log10(min(known))) if known else -2
+    high = min(max(math.ceil(math.log10(max(known))), low + 1), low + 9) if known else 2
+    verdict_word = str(raw.get("verdict") or "not assessed")
+    return Observability(
+        tone=_OBSERVABILITY_TONES.get(verdict_word, "open"),
+        verdict=verdict_word,
+        sentences=_texts(raw.get("sentences")),
+        named_cases=_texts(raw.get("named_cases")),
+        advice=_texts(raw.get("advice")),
+        directions=tuple(_direction(found[index], sigmas[index], low, high) for index in order),
+        ticks=tuple((100.0 * (power - low) / (high - low), f"{10.0**power:g}") for power in _decades(low, high)),
+    )
+
+
+def _direction(raw: Mapping[str, Any], sigma: float | None, low: int, high: int) -> Direction:
+    percent = 100.0
+    if sigma is not None:
+        percent = 0.0 if sigma <= 0.0 else 100.0 * (math.log10(sigma) - low) / (high - low)
+    vector = raw.get("vector")
+    return Direction(
+        words=str(raw.get("words") or "not described"),
+        sigma_mm="not bounded" if sigma is None else f"{significant(sigma, 2)} mm",
+        bar_percent=round(min(max(percent, 0.5), 100.0), 2),
+        vector="" if vector is None else "  ".join(fixed(component, 3) for component in vector),
+    )
+
+
+def _decades(low: int, high: int) -> range:
+    return range(low, high + 1, 1 if high - low <= 5 else 2)
+
+
+def _texts(value: Any) -> tuple[str, ...]:
+    if value is None:
+        return ()
+    return (value,) if isinstance(value, str) else tuple(str(item) for item in value)
+
+
+def nuisances(result: CalibrationResult) -> tuple[Row, ...]:
+    """Everything else that was estimated or assumed, with its sigma."""
+    return tuple(
+        Row(name, any_value(entry.get("value")), _sigma(entry.get("sigma")), str(entry.get("unit") or ""))
+        for name, entry in result.nuisances.items()
+    )
+
+
+def _sigma(value: Any) -> str:
+    return "" if value is None else any_value(value, 2)
+
+
+def head_point_errors(result: CalibrationResult) -> tuple[tuple[str, ...], ...]:
+    """Camera, median, rms, largest (px) and count."""
+    errors = result.head_point_error_px or {}
+    return tuple(
+        (
+            camera,
+            *(significant(entry.get(key)) for key in ("median", "rms", "max")),
+            any_value(entry.get("count")),
+        )
+        for camera, entry in errors.items()
+    )
+
+
+def created(result: CalibrationResult) -> str:
+    """When the result was made, to the minute or second that it states, for readers rather than parsers."""
+    return result.created.replace("T", " ", 1).replace("+00:00", " UTC")
+
+
+def covariance_text(covariance: np.ndarray | None) -> str:
+    """The covariance as six aligned lines, empty where there is none."""
+    if covariance is None:
+        return ""
+    return "\n".join("  ".join(_covariance_cell(cell) for cell in row) for row in covariance)
+
+
+def _covariance_cell(value: Any) -> str:
+    number = finite(value)
+    return f"{UNKNOWN:>10}" if number is None else f"{number: .3e}"
+
+
+def plain_json(value: Any) -> str:
+    """Indented JSON for the folded blocks."""
+    return json.dumps(finite_or_none(value), indent=2, ensure_ascii=False, default=str)
