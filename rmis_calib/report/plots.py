@@ -101,7 +101,7 @@ def _by_motion(
     axes.axhline(float(np.median(_counted(values, used))), color=_INK, linewidth=0.8, linestyle=(0, (4, 3)))
     axes.set(xlim=(-0.5 - 0.01 * len(values), len(values) * 1.01 - 0.5), ylim=_padded(limits))
     axes.set(xlabel="motion", ylabel=f"residual, {unit}")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.xaxis.set_major_locator(_whole_numbers())
     axes.grid(axis="y", color=_HAIRLINE, linewidth=0.6)
     return _svg(figure, f"{name} by motion")
 
@@ -136,9 +136,13 @@ def _histogram(
     for mark in (scale,) if limits[0] == 0.0 else (-scale, scale):
         axes.axvline(mark, color=_INK, linewidth=0.8, linestyle=(0, (1, 2)), zorder=4)
     axes.set(xlim=limits, xlabel=f"residual, {unit}", ylabel="motions")
-    axes.yaxis.set_major_locator(MaxNLocator(6, integer=True))
+    axes.yaxis.set_major_locator(_whole_numbers())
     axes.grid(axis="y", color=_HAIRLINE, linewidth=0.6)
     return _svg(figure, f"{name}, histogram")
+
+
+def _whole_numbers() -> MaxNLocator:
+    return MaxNLocator(6, steps=[1, 2, 5, 10], integer=True)
 
 
 def _padded(limits: tuple[float, float]) -> tuple[float, float]:
