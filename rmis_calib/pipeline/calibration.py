@@ -1,0 +1,227 @@
+"""The calibration of one recording: detect, forward kinematics, assemble, solve, choose again, check."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rmis_calib.config import CalibrationConfig
+from rmis_calib.errors import InsufficientDataError
+from rmis_calib.io import Recording, ShaftObservations
+from rmis_calib.pipeline.detection import Progress, View, detect_recording, no_progress
+from rmis_calib.pipeline.estimation import (
+    estimate,
+    make_result,
+    raise_unless_trustworthy,
+    residual_arrays,
+    residual_record,
+    used_motions,
+)
+from rmis_calib.pipeline.evaluation import head_point_errors, summarise_head_points
+from rmis_calib.pipeline.observing import (
+    Choice,
+    assemble,
+    consistent_choice,
+    first_choice,
+    predict_contours,
+    predict_ends,
+    reasons_for,
+    select_frames,
+)
+from rmis_calib.pipeline.poses import MotionPoses, motion_poses
+from rmis_calib.results import STATUS_SENTENCES, CalibrationResult, Motions
+from rmis_calib.solver import Solution
+
+JOINTS_UNKNOWN = "the joint log does not cover this time"
+CHOICE_ROUNDS = 3
+"""Solves at most: a choice of candidates that has not settled by then alternates between equals."""
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationRun:
+    """A result with everything it came from, for reports and for solving again.
+
+    Attributes:
+        result: the answer.
+        recording: what was calibrated.
+        views: frames and detections of each camera.
+        poses: kinematics of the motions.
+        choices: candidate taken in each view.
+        observations: what the solver saw.
+        solution: what the solver returned; None when there were too few motions to solve.
+    """
+
+    result: CalibrationResult
+    recording: Recording
+    views: tuple[View, ...]
+    poses: MotionPoses
+    choices: tuple[Choice, ...]
+    observations: ShaftObservations | None
+    solution: Solution | None
+
+    def predicted_contours(self, view: View) -> Float[Tensor, "m 2 3"] | None:
+        """Contour planes where the result puts the shaft, in one view's camera."""
+        camera_T_arm = self._camera_T_arm(view)
+        if camera_T_arm is None:
+            return None
+        return predict_contours(
+            camera_T_arm, self.poses, self._estimated("radius", self.recording.shaft_diameter_mm / 2)
+        )
+
+    def predicted_ends(self, view: View) -> Float[Tensor, "m 3"] | None:
+        """Where the result puts the shaft's end, mm, in one view's camera."""
+        camera_T_arm = self._camera_T_arm(view)
+        return (
+            None if camera_T_arm is None else predict_ends(camera_T_arm, self.poses, self._estimated("end_offset", 0.0))
+        )
+
+    def _camera_T_arm(self, view: View) -> Float[Tensor, "4 4"] | None:
+        transform = self.result.camera_right_T_arm if view.side == "right" else self.result.camera_left_T_arm
+        return None if transform is None else transform.matrix.to(self.poses.arm_T_rcm.device)
+
+    def _estimated(self, name: str, otherwise: float) -> float:
+        return float(self.result.nuisances.get(name, {"value": otherwise})["value"])
+
+
+def calibrate(
+    recording: Recording,
+    config: CalibrationConfig | None = None,
+    *,
+    progress: Progress = no_progress,
+    throw: bool = True,
+) -> CalibrationResult:
+    """Find `camera_right_T_arm` of a recording.
+
+    Args:
+        recording: from `load_recording`.
+        config: the defaults when None.
+        progress: called with (stage, done, total).
+        throw: raise when the result is not trustworthy; otherwise its `status` and `message` say so.
+    Raises:
+        CalibrationFailed: no trustworthy result (with `throw`); its `result` holds what there is.
+        InputError, FileError: the recording breaks its format.
+    """
+    result = run_calibration(recording, config, progress).result
+    if throw:
+        raise_unless_trustworthy(result)
+    return result
+
+
+def run_calibration(
+    recording: Recording, config: CalibrationConfig | None = None, progress: Progress = no_progress
+) -> CalibrationRun:
+    """The whole calibration, keeping what each step made.
+
+    Source: paper, Algorithm 1, with detection before it and a check of the answer after it.
+    """
+    config = config or CalibrationConfig()
+    poses = motion_poses(recording, config.device)
+    views = detect_recording(recording, config, progress)
+    choices = tuple(first_choice(select_frames(view.detections, poses.frames)) for view in views)
+    run = _solve_choice(recording, config, views, poses, choices, progress)
+    for _ in range(CHOICE_ROUNDS - 1):
+        better = _choose_again(run)
+        if better is None or all(new.same_as(old) for new, old in zip(better, run.choices, strict=True)):
+            break
+        run = _solve_choice(recording, config, views, poses, better, progress)
+    return run
+
+
+def _solve_choice(
+    recording: Recording,
+    config: CalibrationConfig,
+    views: tuple[View, ...],
+    poses: MotionPoses,
+    choices: tuple[Choice, ...],
+    progress: Progress,
+) -> CalibrationRun:
+    """Assemble the chosen candidates, solve, and say what came out."""
+    seen = torch.stack([choice.taken for choice in choices]).any(dim=0)
+    if int(seen.sum()) < config.min_motions:
+        motions = _motions(recording, views, poses, choices, None)
+        return CalibrationRun(_insufficient(config, motions), recording, views, poses, choices, None, None)
+    progress("solving", 0, 1)
+    observations = assemble(recording, poses, views, choices)
+    try:
+        solution = estimate(observations, config)
+    except InsufficientDataError as error:
+        motions = _motions(recording, views, poses, choices, None)
+        result = _insufficient(config, motions, str(error))
+        return CalibrationRun(result, recording, views, poses, choices, observations, None)
+    progress("solving", 1, 1)
+    motions = _motions(recording, views, poses, choices, solution)
+    result = make_result(solution, motions, _residuals_px(recording, poses, solution), config)
+    errors = head_point_errors(result, recording, poses)
+    residuals = result.residuals | {
+        f"head point {side}": residual_record(distance, "px") for side, distance in (errors or {}).items()
+    }
+    result = replace(result, residuals=residuals, head_point_error_px=summarise_head_points(errors))
+    return CalibrationRun(result, recording, views, poses, choices, observations, solution)
+
+
+def _choose_again(run: CalibrationRun) -> tuple[Choice, ...] | None:
+    """Candidates nearest to what the first answer predicts; None when there is no answer to predict from."""
+    predictions = [run.predicted_contours(view) for view in run.views]
+    if run.solution is None or any(prediction is None for prediction in predictions):
+        return None
+    return tuple(
+        consistent_choice(select_frames(view.detections, run.poses.frames), prediction)
+        for view, prediction in zip(run.views, predictions, strict=True)
+        if prediction is not None
+    )
+
+
+def _motions(
+    recording: Recording,
+    views: tuple[View, ...],
+    poses: MotionPoses,
+    choices: tuple[Choice, ...],
+    solution: Solution | None,
+) -> Motions:
+    """Used and rejected frames, each rejected one with its first reason."""
+    used = np.zeros(recording.n_frames, dtype=bool)
+    reasons = [JOINTS_UNKNOWN] * recording.n_frames
+    by_view = [reasons_for(view, poses, choice) for view, choice in zip(views, choices, strict=True)]
+    solved, solver_reasons = (None, None) if solution is None else used_motions(solution)
+    for motion, frame in enumerate(poses.frames):
+        missing = [view_reasons[motion] for view_reasons in by_view]
+        if all(missing):
+            reasons[frame] = missing[0]
+        elif solved is None or solver_reasons is None:
+            reasons[frame] = ""
+        else:
+            used[frame], reasons[frame] = bool(solved[motion]), solver_reasons[motion]
+    return Motions(used, tuple(reasons), recording.frame_times_s)
+
+
+def _residuals_px(recording: Recording, poses: MotionPoses, solution: Solution) -> dict[str, dict[str, Any]]:
+    """Residuals of each kind and camera in pixels, by frame."""
+    left = recording.stereo.left
+    arrays = residual_arrays(
+        solution, float(recording.stereo.right.focal), float(left.focal) if left is not None else 1.0
+    )
+    records = {}
+    for name, by_motion in arrays.items():
+        by_frame = np.full(recording.n_frames, np.nan)
+        by_frame[poses.frames] = by_motion
+        records[name] = residual_record(by_frame, "px")
+    return records
+
+
+def _insufficient(config: CalibrationConfig, motions: Motions, why: str | None = None) -> CalibrationResult:
+    usable = sum(reason == "" for reason in motions.reasons)
+    why = why or f"{usable} of {len(motions.used)} motions are usable, {config.min_motions} are needed"
+    return CalibrationResult(
+        status="insufficient_data",
+        message=f"{STATUS_SENTENCES['insufficient_data']}: {why}",
+        method=config.solver.method,
+        camera_right_T_arm=None,
+        camera_left_T_camera_right=None,
+        covariance=None,
+        observability={"verdict": "unobservable", "sentences": [why]},
+        motions=motions,
+        config=config.to_dict(),
+    )

@@ -1,0 +1,164 @@
+"""Observations to the answer: the solver's tensors turned into a result with frames, units and a status."""
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from rmis_calib.config import CalibrationConfig
+from rmis_calib.errors import CalibrationFailed
+from rmis_calib.geometry.rigid import RigidTransform
+from rmis_calib.io import ShaftObservations
+from rmis_calib.results import STATUS_SENTENCES, CalibrationResult, Motions, Status
+from rmis_calib.solver import Problem, Solution, SolveStatus
+from rmis_calib.solver import solve as solve_problem
+from rmis_calib.solver.solution import MotionReason, Observability
+
+MEASUREMENT_KEYS = {"axis": "axis", "contours": "contour", "ends": "end", "heads": "head"}
+
+
+def solve(
+    observations: ShaftObservations, config: CalibrationConfig | None = None, *, throw: bool = True
+) -> CalibrationResult:
+    """Estimate `camera_right_T_arm` from observations.
+
+    Args:
+        observations: N motions in the keys of DESIGN.md 6.2.
+        config: method, measurements to use, noise, thresholds; the defaults when None.
+        throw: raise when the result is not trustworthy; otherwise its `status` and `message` say so.
+    Raises:
+        CalibrationFailed: no trustworthy result (with `throw`); its `result` holds what there is.
+        InsufficientDataError: too few motions.
+    """
+    config = config or CalibrationConfig()
+    solution = estimate(observations, config)
+    motions = Motions(*used_motions(solution))
+    result = make_result(solution, motions, residuals_normalised(solution), config)
+    if throw:
+        raise_unless_trustworthy(result)
+    return result
+
+
+def estimate(observations: ShaftObservations, config: CalibrationConfig) -> Solution:
+    """Run the configured solver on the configured kinds of measurement."""
+    problem = Problem.from_observations(observations, device=config.device)
+    return solve_problem(problem.only(*config.measurements), config.solver)
+
+
+def raise_unless_trustworthy(result: CalibrationResult) -> None:
+    """Turn a result that did not pass its own checks into an exception that carries it.
+
+    Raises:
+        CalibrationFailed: always, unless the status is `ok`.
+    """
+    if not result.trustworthy:
+        raise CalibrationFailed(result.message, result)
+
+
+def make_result(
+    solution: Solution,
+    motions: Motions,
+    residuals: dict[str, dict[str, Any]],
+    config: CalibrationConfig,
+    head_point_error_px: dict[str, dict[str, float]] | None = None,
+) -> CalibrationResult:
+    """The result of one solve (no trial batch)."""
+    status, message = judge(solution)
+    finite = bool(torch.isfinite(solution.camera_right_T_arm).all())
+    covariance = solution.covariance.cpu().numpy()
+    stereo = solution.camera_left_T_camera_right
+    return CalibrationResult(
+        status=status,
+        message=message,
+        method=solution.method,
+        camera_right_T_arm=_transform("camera_right", "arm", solution.camera_right_T_arm) if finite else None,
+        camera_left_T_camera_right=None if stereo is None else _transform("camera_left", "camera_right", stereo),
+        covariance=covariance if np.isfinite(covariance).all() else None,
+        observability=observability_record(solution.observability[0]),
+        motions=motions,
+        residuals=residuals,
+        nuisances=_nuisance_records(solution),
+        head_point_error_px=head_point_error_px,
+        config=config.to_dict(),
+    )
+
+
+def judge(solution: Solution) -> tuple[Status, str]:
+    """Status and its one line: a solve that did not work first, then what the data can tell."""
+    status = SolveStatus(int(solution.status))
+    observability = solution.observability[0]
+    if status is not SolveStatus.CONVERGED:
+        return "solver_failed", f"{STATUS_SENTENCES['solver_failed']}: {status.sentence}"
+    names: dict[str, Status] = {"trustworthy": "ok", "weak": "weak", "unobservable": "unobservable"}
+    name = names[observability.verdict.value]
+    return name, f"{STATUS_SENTENCES[name]}: {observability.sentence}"
+
+
+def used_motions(solution: Solution) -> tuple[np.ndarray, tuple[str, ...]]:
+    """(N,) whether each motion of the solve was used, and why not."""
+    codes = [MotionReason(int(code)) for code in solution.reason.cpu()]
+    used = np.array([code in (MotionReason.USED, MotionReason.OUTLIER_ONE_CAMERA) for code in codes])
+    return used, tuple("" if code is MotionReason.USED else code.sentence for code in codes)
+
+
+def residuals_normalised(solution: Solution) -> dict[str, dict[str, Any]]:
+    """Residuals per kind and camera in normalised image units, for observations without a camera."""
+    return {
+        name: residual_record(by_motion, "1e-3 of the focal length")
+        for name, by_motion in residual_arrays(solution, 1e3, 1e3).items()
+    }
+
+
+def residual_arrays(solution: Solution, scale_right: float, scale_left: float) -> dict[str, np.ndarray]:
+    """(N,) residuals of each kind and camera, times the camera's scale (its focal length turns them into px)."""
+    scales = (("right", scale_right), ("left", scale_left))
+    arrays = {}
+    for kind in ("lines", "ends", "heads"):
+        values = getattr(solution, f"residual_{kind}").cpu().numpy()
+        for row, (side, scale) in zip(values, scales, strict=False):
+            if np.isfinite(row).any():
+                arrays[f"{kind} {side}"] = row * scale
+    return arrays
+
+
+def residual_record(by_motion: np.ndarray, unit: str) -> dict[str, Any]:
+    """Median and root mean square of what was measured, with the value of every motion."""
+    known = by_motion[np.isfinite(by_motion)]
+    median = float(np.median(known)) if len(known) else None
+    rms = float(np.sqrt(np.mean(known**2))) if len(known) else None
+    return {"unit": unit, "median": median, "rms": rms, "by_motion": by_motion}
+
+
+def observability_record(observability: Observability) -> dict[str, Any]:
+    """What the data can and cannot see, as plain values."""
+    return {
+        "verdict": observability.verdict.value,
+        "sentences": [observability.sentence],
+        "working_point_mm": list(observability.working_point_mm),
+        "working_point_sigma_mm": observability.working_point_sigma_mm,
+        "directions": [
+            {"sigma_at_working_point_mm": sigma, "words": words} for sigma, words in observability.directions
+        ],
+        "named_cases": list(observability.degeneracies),
+    }
+
+
+def _nuisance_records(solution: Solution) -> dict[str, dict[str, Any]]:
+    """Every other unknown with its sigma, and the noise levels that were used."""
+    records: dict[str, dict[str, Any]] = {}
+    for name, nuisance in solution.nuisances.items():
+        values, sigmas, held = (item.reshape(-1).tolist() for item in (nuisance.value, nuisance.sigma, nuisance.held))
+        for index, (value, sigma, is_held) in enumerate(zip(values, sigmas, held, strict=True)):
+            key = name if len(values) == 1 else f"{name}[{index}]"
+            records[key] = {"value": value, "sigma": sigma, "unit": nuisance.unit, "held": is_held}
+    for name, level in solution.noise.items():
+        records[f"noise {name}"] = {"value": float(level), "sigma": None, "unit": _noise_unit(name)}
+    return records
+
+
+def _noise_unit(name: str) -> str:
+    return name.rpartition("_")[2] if name.endswith(("_mm", "_rad", "_deg")) else "x nominal"
+
+
+def _transform(dst: str, src: str, matrix: torch.Tensor) -> RigidTransform:
+    return RigidTransform(dst, src, matrix.detach().cpu())

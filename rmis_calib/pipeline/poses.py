@@ -1,0 +1,49 @@
+"""Joint readings at frame times, as the poses that the solver needs."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rmis_calib.geometry.rigid import rigid_inverse
+from rmis_calib.io import Recording
+from rmis_calib.kinematics import RobotKinematics
+
+
+@dataclass(frozen=True, eq=False)
+class MotionPoses:
+    """Kinematics of the motions whose joints are known.
+
+    Attributes:
+        frames: (M,) frame number of each motion.
+        arm_T_rcm: (M, 4, 4) RCM frame in the laparoscope arm's end-effector frame, mm.
+        rcm_v_axis: (M, 3) unit direction of the shaft, RCM to tip.
+        rcm_s_end_mm: (M,) nominal coordinate of the shaft's end along the axis from the RCM.
+        rcm_p_head: (M, 3) head point, mm.
+    """
+
+    frames: np.ndarray
+    arm_T_rcm: Float[Tensor, "m 4 4"]
+    rcm_v_axis: Float[Tensor, "m 3"]
+    rcm_s_end_mm: Float[Tensor, " m"]
+    rcm_p_head: Float[Tensor, "m 3"]
+
+
+def motion_poses(recording: Recording, device: str = "cpu") -> MotionPoses:
+    """Forward kinematics of both arms, at the time of every frame that the joint log covers, in one batched call.
+
+    Raises:
+        RobotError: the robot's description cannot carry the recording's arms.
+    """
+    kinematics = RobotKinematics(recording.robot, recording.laparoscope_arm, recording.instrument_arm, device=device)
+    instrument, known = recording.joints_at_frames(recording.instrument_arm)
+    laparoscope, laparoscope_known = recording.joints_at_frames(recording.laparoscope_arm)
+    frames = np.flatnonzero(known & laparoscope_known)
+    instrument_pose = kinematics.instrument(torch.as_tensor(instrument[frames], device=device))
+    base_T_arm = kinematics.base_T_arm(torch.as_tensor(laparoscope[frames], device=device))
+    arm_T_rcm = rigid_inverse(base_T_arm) @ instrument_pose.base_T_rcm
+    return MotionPoses(
+        frames, arm_T_rcm, instrument_pose.rcm_v_axis, instrument_pose.rcm_s_end_mm, instrument_pose.rcm_p_head
+    )
