@@ -98,16 +98,13 @@ def draw_instrument(
     blur_px: float,
     gamma: float,
 ) -> None:
-    """Paint the instrument over `picture` (B, 3, H, W), encoded values 0 to 1, in place."""
+    """Paint the instrument over `picture` (B, H, W, 3), encoded values 0 to 1, in place."""
     batch = len(picture)
     flat, pixels = _gather(rays, poses, batch)
     if not len(flat):
         return
-    area = picture.shape[2] * picture.shape[3]
-    index = flat + torch.div(flat, area, rounding_mode="floor") * (2 * area)  # of the red value in (B, 3, H, W)
-    values = picture.view(-1)
-    channels = torch.stack([index, index + area, index + 2 * area], dim=-1)
-    colour = values[channels]
+    values = picture.view(-1, 3)
+    colour = values[flat]
     colour = _jaws(colour, pixels, rays, poses, camera_p_light, blur_px, gamma)
     cylinders = make_cylinders(poses.p_axis, poses.v_axis, camera_p_light.to(poses.p_axis).expand_as(poses.p_axis))
     s_end, s_head = poses.s_end.float(), poses.s_head.float()
@@ -117,7 +114,7 @@ def draw_instrument(
         (1.0, DARK_GREY, everywhere, s_end),
     ):
         colour = _cylinder(colour, pixels, cylinders, ratio * poses.radius, surface, s_from, s_to, blur_px, gamma)
-    values[channels] = colour
+    values[flat] = colour
 
 
 def _cylinder(

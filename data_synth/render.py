@@ -32,7 +32,7 @@ class _View:
 
 
 class Renderer:
-    """Renders frames of a world. Convention: pictures are (B, 3, H, W) uint8 RGB."""
+    """Renders frames of a world."""
 
     def __init__(self, world: World, device: str | torch.device = "cpu") -> None:
         self.world = world
@@ -63,13 +63,13 @@ class Renderer:
         return _View(camera, rays, self._tensor(coarse_rays), coarse_size, self._tensor(vignette))
 
     def render(self, side: str, frames: Array) -> Tensor:
-        """Pictures (B, 3, H, W) of one camera at frame indices (B,)."""
+        """Pictures (B, H, W, 3), uint8 RGB, of one camera at frame indices (B,)."""
         with torch.inference_mode():
             picture = self._encoded(side, frames)
             return self._expose(picture, frames, side)
 
     def _encoded(self, side: str, frames: Array) -> Tensor:
-        """Encoded pictures (B, 3, H, W), 0 to 1, without noise."""
+        """Encoded pictures (B, H, W, 3), 0 to 1, without noise."""
         world, view, look = self.world, self.views[side], self.world.config.look
         times = world.frame_times_s[frames]
         light = transform_points(world.camera_T_camera_right(side), CAMERA_RIGHT_P_LIGHT)
@@ -97,7 +97,7 @@ class Renderer:
         return InstrumentPoses(p, v, sideways, s_end, s_head, shaft.radius_mm)
 
     def _expose(self, picture: Tensor, frames: Array, side: str) -> Tensor:
-        """Sensor noise and rounding: (B, 3, H, W) uint8."""
+        """Sensor noise and rounding: (B, H, W, 3) uint8."""
         levels = picture.mul_(255.0)
         sigma = self.world.config.camera.noise_levels
         if sigma > 0.0:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -13,6 +14,8 @@ from data_synth.kinematics import Array, rigid, rotation_from_rotvec
 
 COARSE_PX = 4
 """The surface is intersected at every fourth pixel and interpolated between: its relief is smooth at that scale."""
+STRIP_NODES = 12
+"""Coarse rows shaded at a time on a CPU."""
 HALF_EXTENT_MM = 120.0
 """Half the side of the textured square; beyond it the texture is mirrored."""
 TEXTURE_SIZE = 1024
@@ -36,10 +39,11 @@ def filtered_noise(generator: np.random.Generator, size: int, low: float, high: 
 
 @dataclass(frozen=True)
 class Tissue:
-    """Textures over the square: surface (1, 6, S, S) = encoded colour, slope x, slope y, gloss; relief (1, 1, s, s), mm."""
+    """Textures over the square: encoded colour (S, S, 3); slope x, slope y and gloss (S, S, 3); relief (1, 1, s, s), mm."""
 
     base_T_tissue: Array
-    surface: Tensor
+    colour: Tensor
+    shape: Tensor
     relief: Tensor
 
 
@@ -58,13 +62,18 @@ def build_tissue(seed: int, base_T_camera_home: Array, gamma: float, device: tor
     slope_y, slope_x = np.gradient(fine, mm_per_texel)
     colour = _tissue_colour(generator, size) ** (1.0 / gamma)
     gloss = np.clip(0.6 + 0.3 * filtered_noise(generator, size, 3.0, 30.0), 0.0, 1.2)
-    surface = np.concatenate([colour, slope_x[None], slope_y[None], gloss[None]])
+    shape = np.stack([slope_x, slope_y, gloss], axis=-1)
     coarse = relief[:: size // 256, :: size // 256]
 
     def tensor(values: Array) -> Tensor:
-        return torch.as_tensor(values.astype(np.float32), device=device)
+        return torch.as_tensor(np.ascontiguousarray(values, dtype=np.float32), device=device)
 
-    return Tissue(base_T_camera_home @ camera_T_tissue, tensor(surface[None]), tensor(coarse[None, None].copy()))
+    return Tissue(
+        base_T_tissue=base_T_camera_home @ camera_T_tissue,
+        colour=tensor(np.moveaxis(colour, 0, -1)),
+        shape=tensor(shape),
+        relief=tensor(coarse[None, None]),
+    )
 
 
 def _tissue_colour(generator: np.random.Generator, size: int) -> Array:
@@ -125,24 +134,47 @@ def intersect(tissue: Tissue, rays: Tensor, tissue_T_camera: Tensor, camera_p_li
 
 
 def shade(tissue: Tissue, view: CoarseView, gain: Tensor, grid_size: tuple[int, int], size: tuple[int, int]) -> Tensor:
-    """Encoded picture (B, 3, H, W), 0 to 1, of the surface; `gain` (B, n) multiplies the encoded brightness.
+    """Encoded picture (B, H, W, 3), 0 to 1, of the surface; `gain` (B, n) multiplies the encoded brightness.
 
     Works in encoded values: a product of linear factors is a product of encoded ones, so only one root is taken a pixel.
     """
-    half = torch.nn.functional.normalize(view.to_light + view.to_camera, dim=-1)
+    half = F.normalize(view.to_light + view.to_camera, dim=-1)
     coarse = torch.cat([view.points[..., :2] / HALF_EXTENT_MM, view.to_light, half, gain[..., None]], dim=-1)
     coarse = coarse.mT.unflatten(-1, grid_size)
-    full = ((grid_size[0] - 1) * COARSE_PX + 1, (grid_size[1] - 1) * COARSE_PX + 1)
-    fine = F.interpolate(coarse, size=full, mode="bilinear", align_corners=True)[..., : size[0], : size[1]]
+    # On the CPU in strips that stay in the cache: three times faster than whole pictures (0.4 against 1.3 ns a value).
+    step = grid_size[0] if gain.is_cuda else STRIP_NODES
+    picture = gain.new_empty(len(gain), *size, 3)
+    for row in range(0, grid_size[0] - 1, step):
+        nodes = coarse[:, :, row : row + step + 1]
+        strip = picture[:, row * COARSE_PX : (row + step) * COARSE_PX]
+        full = ((nodes.shape[2] - 1) * COARSE_PX + 1, (grid_size[1] - 1) * COARSE_PX + 1)
+        fine = F.interpolate(nodes, size=full, mode="bilinear", align_corners=True)
+        _shade_strip(tissue, fine[..., : strip.shape[1], : strip.shape[2]], strip)
+    return picture
+
+
+def _shade_strip(tissue: Tissue, fine: Tensor, out: Tensor) -> None:
+    """Shade pixels `out` (B, h, W, 3) from texture position, light, half vector and gain: `fine` (B, 9, h, W)."""
     grid = fine[:, :2].movedim(1, -1)
-    sample = F.grid_sample(
-        tissue.surface.expand(len(grid), -1, -1, -1), grid, padding_mode="reflection", align_corners=False
-    )
-    slope_x, slope_y, gloss = sample[:, 3], sample[:, 4], sample[:, 5]
+    colour, shape = _sample(tissue.colour, grid), _sample(tissue.shape, grid)
+    slope_x, slope_y, gloss = shape.unbind(-1)
     normal_z = torch.rsqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
     facing = (fine[:, 4] - slope_x * fine[:, 2] - slope_y * fine[:, 3]) * normal_z
     mirror = (fine[:, 7] - slope_x * fine[:, 5] - slope_y * fine[:, 6]) * normal_z
-    gain_fine = fine[:, 8]
-    brightness = gain_fine * torch.sqrt(torch.clamp(facing, min=0.02))
-    highlight = gloss * gain_fine * torch.exp(GLOSS_SHARPNESS * (mirror - 1.0))
-    return sample[:, :3] * brightness[:, None] + highlight[:, None]
+    gain = fine[:, 8]
+    brightness = gain * torch.sqrt(torch.clamp(facing, min=0.02))
+    highlight = gloss * gain * torch.exp(GLOSS_SHARPNESS * (mirror - 1.0))
+    torch.addcmul(highlight[..., None], colour, brightness[..., None], out=out)
+
+
+def _sample(texture: Tensor, grid: Tensor) -> Tensor:
+    """Bilinear samples (B, H, W, 3) of a texture (S, S, 3) at grid (B, H, W, 2), -1 to 1 across the square, mirrored beyond.
+
+    On the CPU by OpenCV: measured 1.7 ms against 13 ms of torch's grid_sample for one picture of 640x480 on one core.
+    """
+    if texture.is_cuda:
+        planes = texture.movedim(-1, 0)[None].expand(len(grid), -1, -1, -1)
+        return F.grid_sample(planes, grid, padding_mode="reflection", align_corners=False).movedim(1, -1)
+    texels = ((grid + 1.0) * (texture.shape[0] / 2) - 0.5).numpy()
+    pictures = [cv2.remap(texture.numpy(), xy, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT) for xy in texels]
+    return torch.from_numpy(np.stack(pictures))

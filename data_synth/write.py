@@ -23,8 +23,6 @@ from data_synth.settings import OutputSettings, SynthConfig
 from data_synth.truth import SideTruth, side_truth
 from data_synth.world import World, build_world
 
-BATCH = 4
-"""Frames drawn at a time."""
 
 Progress = Callable[[int, int], None]
 
@@ -159,7 +157,7 @@ def _write_pictures(folder: Path, world: World, device: str, on_progress: Progre
         for first in range(0, total, BATCH):
             frames = np.arange(first, min(first + BATCH, total))
             for side, writer in writers.items():
-                pictures = renderer.render(side, frames).permute(0, 2, 3, 1).contiguous().cpu().numpy()
+                pictures = renderer.render(side, frames).cpu().numpy()
                 for picture in pictures:
                     writer.add(picture)
             on_progress(int(frames[-1]) + 1, total)
