@@ -50,9 +50,9 @@ class Camera:
                 raise ShapeError(where=f"camera {name}", expected=f"shape {shape}", found=tuple(value.shape))
             if not bool(torch.isfinite(value).all()):
                 raise InputError(where=f"camera {name}", expected="finite", found=value.tolist())
-        if not (float(self.fx) > 0 and float(self.fy) > 0):
-            found = f"{float(self.fx)}, {float(self.fy)}"
-            raise InputError(where="camera fx, fy", expected="positive focal lengths in px", found=found)
+        focal_lengths = self._affine()[0].detach()
+        if not bool((focal_lengths > 0).all()):
+            raise InputError(where="camera fx, fy", expected="positive focal lengths, px", found=focal_lengths.tolist())
         if not (len(self.image_size) == 2 and min(self.image_size) > 0):
             raise InputError(
                 where="camera image_size", expected="(height, width), both positive", found=self.image_size

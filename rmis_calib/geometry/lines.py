@@ -36,7 +36,7 @@ def line_through_points(
 
     Convention: with x right and y down, the line is positive on the right-hand side of somebody who walks from a to b.
     """
-    line = torch.linalg.cross(_homogeneous(xy_a), _homogeneous(xy_b))
+    line = _join(xy_a, xy_b)
     return line / _safe_norm(line[..., :2])
 
 
@@ -47,7 +47,7 @@ def plane_normal_from_points(
 
     Convention: (xa, ya, 1) x (xb, yb, 1); positive on the right-hand side of somebody who walks from a to b.
     """
-    normal = torch.linalg.cross(_homogeneous(xy_a), _homogeneous(xy_b))
+    normal = _join(xy_a, xy_b)
     return normal / _safe_norm(normal)
 
 
@@ -135,8 +135,11 @@ def axis_from_contours(
     return AxisPlane(total / twice_cosine, difference / twice_sine, half_angle, distance)
 
 
-def _homogeneous(xy: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
-    return torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1)
+def _join(xy_a: Float[Tensor, "*#batch 2"], xy_b: Float[Tensor, "*#batch 2"]) -> Float[Tensor, "*#batch 3"]:
+    # (xa, ya, 1) x (xb, yb, 1) with the difference of the points taken first: no cancellation where they are close.
+    xa, ya = torch.broadcast_to(xy_a, torch.broadcast_shapes(xy_a.shape, xy_b.shape)).unbind(-1)
+    dx, dy = (xy_b - xy_a).unbind(-1)
+    return torch.stack([-dy, dx, xa * dy - ya * dx], dim=-1)
 
 
 def _safe_norm(v: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch 1"]:

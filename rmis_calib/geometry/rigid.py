@@ -173,14 +173,20 @@ class RigidTransform:
         except (TypeError, ValueError) as error:
             raise InputError(where="rigid transform", expected="numbers in nested lists", found=str(error)) from error
         transform = cls(str(values["dst"]), str(values["src"]), given["matrix"])
-        if "translation_mm" in given and not _close(given["translation_mm"], transform.t):
-            raise InputError(
-                where=transform.name, expected="translation_mm equal to the matrix's last column", found="another"
-            )
-        if "quat_wxyz" in given and not _close(quat_to_matrix(given["quat_wxyz"]), transform.R):
-            raise InputError(where=transform.name, expected="quat_wxyz equal to the matrix's rotation", found="another")
+        for key, other in (("translation_mm", transform.t), ("quat_wxyz", transform.quat_wxyz)):
+            if key in given and given[key].shape != other.shape:
+                raise InputError(
+                    where=f"{transform.name} {key}",
+                    expected=f"shape {tuple(other.shape)}",
+                    found=tuple(given[key].shape),
+                )
+        agree = _close(given.get("translation_mm", transform.t), transform.t)
+        agree = agree and _close(quat_to_matrix(given.get("quat_wxyz", transform.quat_wxyz)), transform.R)
+        if not agree:
+            expected = "quat_wxyz and translation_mm equal to what the matrix says"
+            raise InputError(where=transform.name, expected=expected, found="another rotation or translation")
         return transform
 
 
 def _close(a: Tensor, b: Tensor) -> bool:
-    return a.shape == b.shape and bool(torch.allclose(a, b, rtol=1e-6, atol=1e-6))
+    return bool(torch.allclose(a, b, rtol=1e-6, atol=1e-6))
