@@ -25,11 +25,11 @@ RESULT_FORMAT = "rmis-calib-result/1"
 Status = Literal["ok", "weak", "unobservable", "solver_failed", "insufficient_data"]
 
 STATUS_SENTENCES: dict[str, str] = {
-    "ok": "the result passed its own checks",
-    "weak": "the data constrain the transform too loosely to be trusted",
-    "unobservable": "the data cannot tell the transform",
-    "solver_failed": "the solver did not reach a solution",
-    "insufficient_data": "too few motions with a usable shaft",
+    "ok": "The result passed its own checks",
+    "weak": "The data constrain the transform too loosely to be trusted",
+    "unobservable": "The data cannot tell the transform",
+    "solver_failed": "The solver did not reach a solution",
+    "insufficient_data": "Too few motions with a usable shaft",
 }
 
 
@@ -179,14 +179,15 @@ class CalibrationResult:
         if found != RESULT_FORMAT:
             raise InputError(where=str(path), expected=f"format {RESULT_FORMAT}", found=found)
         try:
-            return cls._from_dict(raw)
+            return cls.from_dict(raw)
         except (KeyError, TypeError) as error:
             raise InputError(
                 where=str(path), expected="every key of a result", found=f"missing or odd {error}"
             ) from error
 
     @classmethod
-    def _from_dict(cls, raw: dict[str, Any]) -> "CalibrationResult":
+    def from_dict(cls, raw: dict[str, Any]) -> "CalibrationResult":
+        """Inverse of `to_dict`."""
         covariance = raw["covariance"]
         return cls(
             status=raw["status"],

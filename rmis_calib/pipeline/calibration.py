@@ -156,7 +156,7 @@ def _solve_choice(
     result = make_result(solution, motions, _residuals_px(recording, poses, solution), config)
     errors = head_point_errors(result, recording, poses)
     residuals = result.residuals | {
-        f"head point {side}": residual_record(distance, "px") for side, distance in (errors or {}).items()
+        f"head_{side}": residual_record(distance, "px") for side, distance in (errors or {}).items()
     }
     result = replace(result, residuals=residuals, head_point_error_px=summarise_head_points(errors))
     return CalibrationRun(result, recording, views, poses, choices, observations, solution)

@@ -113,11 +113,11 @@ def residual_arrays(solution: Solution, scale_right: float, scale_left: float) -
     """(N,) residuals of each kind and camera, times the camera's scale (its focal length turns them into px)."""
     scales = (("right", scale_right), ("left", scale_left))
     arrays = {}
-    for kind in ("lines", "ends", "heads"):
+    for name, kind in (("contour", "lines"), ("end", "ends"), ("head", "heads")):
         values = getattr(solution, f"residual_{kind}").cpu().numpy()
         for row, (side, scale) in zip(values, scales, strict=False):
             if np.isfinite(row).any():
-                arrays[f"{kind} {side}"] = row * scale
+                arrays[f"{name}_{side}"] = row * scale
     return arrays
 
 

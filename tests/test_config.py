@@ -1,0 +1,55 @@
+"""Configuration: one definition, unknown keys and impossible values refused with their names."""
+
+import pytest
+
+from rmis_calib.config import CalibrationConfig, load_config, parse_config
+from rmis_calib.errors import ConfigError, FileError, InputError
+
+
+def test_defaults_run_everything():
+    assert parse_config({}) == CalibrationConfig()
+
+
+def test_nested_values_are_taken():
+    config = parse_config({"device": "cuda:1", "solver": {"method": "paper"}, "detector": {"max_shafts": 2}})
+    assert (config.device, config.solver.method, config.detector.max_shafts) == ("cuda:1", "paper", 2)
+
+
+@pytest.mark.parametrize(
+    ("raw", "words"),
+    [
+        ({"divice": "cpu"}, ["divice", "did you mean device"]),
+        ({"solver": {"metod": "paper"}}, ["solver.metod", "did you mean method"]),
+        ({"solver": {"method": "magic"}}, ["solver.method", "magic"]),
+        ({"device": "gpu"}, ["device", "gpu"]),
+        ({"device": "cuda:"}, ["device"]),
+        ({"batch_size": 0}, ["batch_size"]),
+        ({"batch_size": float("nan")}, ["batch_size"]),
+        ({"measurements": ["ends"]}, ["measurements"]),
+        ({"measurements": ["lines"]}, ["measurements", "lines"]),
+    ],
+)
+def test_mistakes_are_named(raw, words):
+    with pytest.raises(ConfigError) as caught:
+        parse_config(raw, where="my.yaml")
+    assert all(word in str(caught.value) for word in ["my.yaml", *words])
+    assert "\n" not in str(caught.value)
+
+
+def test_yaml_file(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("batch_size: 3\nsolver: {tolerance_sigma: 1e-4}\n")
+    config = load_config(path)
+    assert (config.batch_size, config.solver.tolerance_sigma) == (3, 1e-4)
+
+
+def test_missing_file_and_preset(tmp_path):
+    with pytest.raises(FileError):
+        load_config(tmp_path / "absent.yaml")
+    with pytest.raises(InputError, match="no-such-preset"):
+        load_config("no-such-preset")
+
+
+def test_round_trip_through_plain_values():
+    config = parse_config({"measurements": ["contours"], "solver": {"method": "global"}})
+    assert parse_config(config.to_dict()) == config
