@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from rmis_calib.kinematics.dh import JointRow, build_chain, frame_poses
 _MAX_RCM_MISS_MM = 1.0
 
 
+@runtime_checkable
 class HeadPointTable(Protocol):
     """A point of the instrument's head that can be seen, fixed in one of its frames."""
 
@@ -27,6 +28,7 @@ class HeadPointTable(Protocol):
     def xyz_mm(self) -> Sequence[float]: ...
 
 
+@runtime_checkable
 class ArmTable(Protocol):
     """One arm of a robot description; what only one of the two arms has is None for the other."""
 
@@ -44,6 +46,7 @@ class ArmTable(Protocol):
     def head_point(self) -> HeadPointTable | None: ...
 
 
+@runtime_checkable
 class RobotTable(Protocol):
     """A robot description, as `io.load_robot` reads it."""
 
@@ -117,6 +120,7 @@ class RobotKinematics:
             ShapeError: another number of joints, or another dtype.
         """
         if self._laparoscope is not None:
+            self._laparoscope.check(joints)
             return self._laparoscope.base_T_frames(joints)[..., -1, :, :] @ self._laparoscope.end_T_tool
         if joints.shape[-1] != 0:
             raise ShapeError(where="laparoscope readings", expected="(..., 0): no arm", found=tuple(joints.shape))
@@ -130,6 +134,7 @@ class RobotKinematics:
         Raises:
             ShapeError: another number of joints, or another dtype.
         """
+        self._instrument.check(joints)
         # With the wrist straight the head point is a place on the shaft, whatever the wrist does now.
         before_wrist = torch.arange(joints.shape[-1], device=joints.device) < self._shaft_frame
         straight = torch.where(before_wrist, joints, 0.0)
@@ -174,10 +179,14 @@ class _Arm:
         self._offsets = constant([float(row.offset) for row in table.joints])
         self._chain = build_chain(table.joints, robot.dh_convention, dtype, device)
 
+    def check(self, joints: Tensor) -> None:
+        """Raise ShapeError unless these are readings of this arm, in its precision."""
+        if joints.shape[-1:] != (len(self.names),) or joints.dtype != self._offsets.dtype:
+            expected = f"(..., {len(self.names)}) of {self._offsets.dtype}: {', '.join(self.names)}"
+            found = f"{tuple(joints.shape)} of {joints.dtype}"
+            raise ShapeError(where="joint readings", expected=expected, found=found)
+
     def base_T_frames(self, joints: Float[Tensor, "*batch j"]) -> Float[Tensor, "*batch frames 4 4"]:
-        if joints.shape[-1] != len(self.names):
-            expected = f"(..., {len(self.names)}): {', '.join(self.names)}"
-            raise ShapeError(where="joint readings", expected=expected, found=tuple(joints.shape))
         arm_base_T_frames = frame_poses(self._chain, joints + self._offsets)
         return self._base_T_arm_base @ arm_base_T_frames
 

@@ -1,7 +1,7 @@
 """Denavit-Hartenberg tables as pytorch-kinematics chains."""
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -13,6 +13,7 @@ from torch import Tensor
 from rmis_calib.errors import RobotError, ShapeError
 
 
+@runtime_checkable
 class JointRow(Protocol):
     """One row of a table. Lengths in mm, angles in rad; `offset` in the joint's own unit, added to its reading."""
 
