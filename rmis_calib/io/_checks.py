@@ -9,13 +9,14 @@ from rmis_calib.errors import InputError
 ORTHONORMAL_TOLERANCE = 1e-6
 
 
-def check_rigid(matrix: np.ndarray, where: str, error: type[InputError]) -> None:
+def check_rigid(matrix: np.ndarray, where: str, error: type[InputError], numbers: np.ndarray | None = None) -> None:
     """Refuse what is not a rigid transform.
 
     Args:
         matrix: (4, 4) or (N, 4, 4), finite.
-        where: file and key, for the message; the index of the first bad item is added to it.
+        where: file and key, for the message; the number of the first bad item is added to it.
         error: class to raise.
+        numbers: (N,), what to call the items; their index by default.
 
     Raises:
         error: the rotation is not orthonormal or a reflection, or the last row is not 0 0 0 1.
@@ -32,5 +33,5 @@ def check_rigid(matrix: np.ndarray, where: str, error: type[InputError]) -> None
     for bad, expected, found in checks:
         if bad.any():
             i = int(bad.argmax())
-            place = where if matrix.ndim == 2 else f"{where}[{i}]"
+            place = where if matrix.ndim == 2 else f"{where}[{i if numbers is None else numbers[i]}]"
             raise error(where=place, expected=expected, found=found(i))

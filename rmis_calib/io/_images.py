@@ -21,8 +21,8 @@ class ImageReader:
     """Images in the order of their names, one a frame; all of one size.
 
     Raises:
-        VideoError: the folder holds something else than images, nothing, or names whose order is ambiguous; or the first image
-            cannot be decoded.
+        VideoError: the folder holds something else than images, nothing, or names whose order is ambiguous; or the
+            first image cannot be decoded.
     """
 
     times_s: np.ndarray | None = None

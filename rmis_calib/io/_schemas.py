@@ -56,9 +56,11 @@ class RecordingSchema(Schema):
     clock_offset_s: float = 0.0
 
     @model_validator(mode="after")
-    def _two_arms(self) -> "RecordingSchema":
+    def _two_of_each(self) -> "RecordingSchema":
         if self.laparoscope_arm == self.instrument_arm:
-            raise ValueError(f"expected two different arms, found {self.instrument_arm!r} as laparoscope and instrument")
+            raise ValueError(f"expected two different arms, found {self.instrument_arm!r} for both")
+        if self.left == self.right:
+            raise ValueError(f"expected two different videos, found {self.right!r} for both cameras")
         return self
 
 
@@ -154,5 +156,3 @@ class RobotSchema(Schema):
     name: Annotated[str, StringConstraints(min_length=1)]
     dh_convention: Literal["modified", "standard"]
     arms: Annotated[dict[Name, ArmSchema], Field(min_length=1)]
-
-

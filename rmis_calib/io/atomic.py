@@ -1,7 +1,7 @@
 """Outputs that are whole or absent: written under a temporary name beside the target, then renamed.
 
 A rename inside one folder is atomic, so whoever looks sees the old content or the new one. An error or Ctrl-C removes
-the temporary; a killed process leaves a name that starts with a dot and ends in `.tmp`, which no reader takes for a result.
+the temporary; a killed process leaves a name that starts with a dot and holds `.tmp`: nobody takes it for a result.
 """
 
 import json
@@ -154,9 +154,11 @@ def _check_replaceable(target: Path, overwrite: bool) -> None:
     if not target.is_dir():
         raise OutputError(where=str(target), expected="a folder to write", found="a file")
     if Path.cwd().is_relative_to(target.resolve()):
-        raise OutputError(where=str(target), expected="an output folder of its own", found="the current folder or above")
+        found = "the current folder or one above it"
+        raise OutputError(where=str(target), expected="an output folder of its own", found=found)
     if any(target.iterdir()) and not overwrite:
-        raise OutputError(where=str(target), expected="a new or empty folder", found="one with content; allow overwriting")
+        found = "one with content (and no leave to overwrite it)"
+        raise OutputError(where=str(target), expected="a new or empty folder", found=found)
 
 
 def _swap(temporary: Path, target: Path) -> None:

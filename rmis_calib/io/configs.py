@@ -28,7 +28,9 @@ def config_path(kind: str, name: str, error: type[InputError] = ConfigError) -> 
     if name in known:
         return next(path for folder in _config_folders(kind) if (path := folder / f"{name}.yaml").is_file())
     found = f"{name!r}{did_you_mean(name, known)}"
-    raise error(where=f"{kind} preset", expected=f"one of {', '.join(known) or '(none shipped)'}", found=found)
+    raise error(
+        where=f"{kind.removesuffix('s')} preset", expected=f"one of {', '.join(known) or '(none shipped)'}", found=found
+    )
 
 
 def load_yaml(path: str | Path, error: type[InputError] = ConfigError) -> dict[str, Any]:
@@ -84,7 +86,7 @@ def _yaml_error(path: str | Path, problem: Exception, error: type[InputError]) -
     return error(where=str(path), expected="valid YAML", found=found)
 
 
-class _Yaml12Loader(yaml.CSafeLoader if yaml.__with_libyaml__ else yaml.SafeLoader):
+class _Yaml12Loader(yaml.SafeLoader):
     """Safe loader with the YAML 1.2 core schema; PyYAML's own is 1.1: `1e-3` a string, `no` false, `1:30` ninety."""
 
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}
@@ -93,10 +95,9 @@ class _Yaml12Loader(yaml.CSafeLoader if yaml.__with_libyaml__ else yaml.SafeLoad
         seen: set[Any] = set()
         for key_node, _ in node.value:
             key = self.construct_object(key_node, deep=True)
-            if not isinstance(key, str):
-                raise yaml.constructor.ConstructorError(None, None, f"a key that is not a word: {key!r}", key_node.start_mark)
-            if key in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"key {key!r} is given twice", key_node.start_mark)
+            problem = f"key {key!r} twice" if isinstance(key, str) else f"a key that is not a word: {key!r}"
+            if not isinstance(key, str) or key in seen:
+                raise yaml.constructor.ConstructorError(None, None, problem, key_node.start_mark)
             seen.add(key)
         return super().construct_mapping(node, deep)
 

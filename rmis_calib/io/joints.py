@@ -39,7 +39,7 @@ class JointLog:
     values: np.ndarray
     """(T, J)."""
     max_gap_s: float = math.nan
-    """Widest interval to interpolate across; NaN: five median sample intervals, but 0.05 s at least and 0.5 s at most."""
+    """Widest interval to interpolate across; NaN: five median sample intervals, at least 0.05 s and at most 0.5 s."""
 
     def __post_init__(self) -> None:
         expected = (len(self.timestamps_s), len(self.columns))

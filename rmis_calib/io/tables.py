@@ -37,7 +37,8 @@ def read_frame_times(path: str | Path) -> np.ndarray:
     bad = frames != np.arange(len(frames))
     if bad.any():
         row = int(bad.argmax())
-        raise RecordingError(where=table.where(row, "frame"), expected=f"{row} (0, 1, 2, ...)", found=f"{frames[row]:g}")
+        expected = f"{row} (0, 1, 2, ...)"
+        raise RecordingError(where=table.where(row, "frame"), expected=expected, found=f"{frames[row]:g}")
     return require_increasing(table, "timestamp_s")
 
 

@@ -16,7 +16,7 @@ from rmis_calib.errors import FileError, InputError, VideoError
 from rmis_calib.io._images import SUFFIXES, ImageReader
 from rmis_calib.io._video_file import VideoReader
 
-# Batches decoded ahead of the consumer: one to hide the decoding behind the detection, one more to ride out a key frame.
+# Batches decoded ahead of the consumer: one hides the decoding behind the detection, one more rides out a key frame.
 _BATCHES_AHEAD = 2
 
 

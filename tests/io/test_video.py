@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from recording_files import FPS, FRAMES, HEIGHT, WIDTH, frame_image, frame_number, truncate, write_images, write_video
 
 from rmis_calib.errors import FileError, InputError, VideoError
 from rmis_calib.io.video import open_source
-from recording_files import FPS, FRAMES, HEIGHT, WIDTH, frame_image, frame_number, truncate, write_images, write_video
 
 CONTAINERS = [
     ("v.mp4", "libx264", {}),

@@ -1,0 +1,217 @@
+"""Checks of shaft observations, and their canonical form: rows that do not count are NaN."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from rmis_calib.errors import ObservationsError
+from rmis_calib.io._checks import check_rigid
+from rmis_calib.io._schemas import METRES
+
+REQUIRED = ("arm_T_rcm", "rcm_v_axis", "axis_right")
+_SIDES = ("right", "left")
+_MEASURED = {"axis": (2, 2), "contour": (2, 2, 2), "end": (2,), "head": (2,)}
+_SIGMA = {"axis": (), "contour": (2,), "end": (), "head": ()}
+# Shapes after the first axis, the motions.
+_SHAPES: dict[str, tuple[int, ...]] = {
+    "arm_T_rcm": (4, 4),
+    "rcm_v_axis": (3,),
+    "rcm_s_end_mm": (),
+    "rcm_p_head": (3,),
+    **{f"{kind}_{side}": shape for kind, shape in _MEASURED.items() for side in _SIDES},
+    **{f"sigma_{kind}_{side}": shape for kind, shape in _SIGMA.items() for side in _SIDES},
+}
+_LEVELS = tuple(f"sigma_{what}_{unit}" for what in ("kinematics", "camera", "stereo") for unit in ("mm", "rad"))
+_SCALARS = ("shaft_radius_mm", "sigma_image", *_LEVELS)
+_NEEDS = {"contour": "shaft_radius_mm", "end": "rcm_s_end_mm", "head": "rcm_p_head"}
+# Rounding of single precision stays below; a direction that was never normalised does not.
+_UNIT_TOLERANCE = 1e-6
+# An image coordinate of 10 is 84 degrees off axis. Points on a line may be far out, so the median decides.
+_MAX_MEDIAN_COORDINATE = 10.0
+_RADIUS_MM = (0.5, 15.0)
+
+Arrays = dict[str, Any]
+
+
+def canonical(given: Arrays) -> Arrays:
+    """Checked copies of what is given, with `valid_right` (and `valid_left` where there is a left array) filled in.
+
+    Raises:
+        ObservationsError: see `ShaftObservations`.
+    """
+    n = _motions(given)
+    _check_needs(given)
+    arrays = {name: _array(name, given[name], n) for name in _SHAPES if name in given}
+    scalars = {name: _scalar(name, given[name]) for name in _SCALARS if name in given}
+    if "camera_left_T_camera_right" in given:
+        arrays["camera_left_T_camera_right"] = _extrinsics(given["camera_left_T_camera_right"])
+    known = _finite(arrays["arm_T_rcm"]) & _finite(arrays["rcm_v_axis"])
+    for side in _SIDES:
+        if any(f"{kind}_{side}" in arrays for kind in _MEASURED):
+            valid = _flags(f"valid_{side}", given.get(f"valid_{side}"), n) & known
+            arrays[f"valid_{side}"] = _mask_side(arrays, side, valid)
+    _check_kinematics(arrays)
+    for side in _SIDES:
+        _check_image(arrays, side)
+    return arrays | scalars
+
+
+def _motions(given: Arrays) -> int:
+    shape = np.shape(given["arm_T_rcm"])
+    if len(shape) != 3 or shape[0] < 1:
+        raise ObservationsError(where="arm_T_rcm", expected="shape (N, 4, 4) with N > 0", found=shape)
+    return shape[0]
+
+
+def _check_needs(given: Arrays) -> None:
+    """An array that is of no use without another."""
+    has_left = any(f"{kind}_left" in given for kind in _MEASURED)
+    for side in _SIDES:
+        for kind in _MEASURED:
+            if f"{kind}_{side}" in given and kind in _NEEDS:
+                _need(given, f"{kind}_{side}", _NEEDS[kind])
+            if f"sigma_{kind}_{side}" in given:
+                _need(given, f"sigma_{kind}_{side}", f"{kind}_{side}")
+    if has_left:
+        _need(given, "a left array", "camera_left_T_camera_right")
+    elif "valid_left" in given:
+        raise ObservationsError(where="valid_left", expected="an array measured in the left image", found="none")
+
+
+def _need(given: Arrays, name: str, other: str) -> None:
+    if other not in given:
+        raise ObservationsError(where=name, expected=f"{other} beside it", found="none")
+
+
+def _numbers(name: str, value: Any) -> np.ndarray:
+    """A float64 copy.
+
+    Raises:
+        ObservationsError: not real numbers, or infinity.
+    """
+    try:
+        array = np.asarray(value)
+    except ValueError as error:
+        raise ObservationsError(where=name, expected="an array of numbers", found="ragged nested lists") from error
+    if array.dtype.kind not in "fiu":
+        raise ObservationsError(where=name, expected="real numbers", found=f"dtype {array.dtype}")
+    array = array.astype(np.float64)
+    if np.isinf(array).any():
+        found = f"infinity at {np.argwhere(np.isinf(array))[0].tolist()}"
+        raise ObservationsError(where=name, expected="finite numbers, or NaN for what is not valid", found=found)
+    return array
+
+
+def _array(name: str, value: Any, n: int) -> np.ndarray:
+    array, shape = _numbers(name, value), (n, *_SHAPES[name])
+    if array.shape != shape:
+        raise ObservationsError(where=name, expected=f"shape {shape}", found=array.shape)
+    if name.startswith("sigma_"):
+        bad = ~np.isnan(array) & (array <= 0)
+        if bad.any():
+            found = f"{array[bad][0]:g} at {np.argwhere(bad)[0].tolist()}"
+            raise ObservationsError(where=name, expected="positive numbers, or NaN for sigma_image", found=found)
+        return array
+    array[~_finite(array)] = np.nan
+    return array
+
+
+def _scalar(name: str, value: Any) -> float:
+    array = _numbers(name, value)
+    if array.size != 1 or not np.isfinite(array).all():
+        found = f"shape {array.shape}" if array.size != 1 else "NaN"
+        raise ObservationsError(where=name, expected="one finite number", found=found)
+    number = float(array.item())
+    if name == "shaft_radius_mm" and not _RADIUS_MM[0] <= number <= _RADIUS_MM[1]:
+        hint = METRES if 0 < number < _RADIUS_MM[0] else ""
+        expected = f"a radius of {_RADIUS_MM[0]} to {_RADIUS_MM[1]} mm"
+        raise ObservationsError(hint, where=name, expected=expected, found=f"{number:g}")
+    # A point without any error has infinite weight; kinematics without error are a thing to assume.
+    if number < 0 or (name == "sigma_image" and number == 0):
+        expected = "a positive number" if name == "sigma_image" else "zero or a positive number"
+        raise ObservationsError(where=name, expected=expected, found=f"{number:g}")
+    return number
+
+
+def _extrinsics(value: Any) -> np.ndarray:
+    name = "camera_left_T_camera_right"
+    array = _numbers(name, value)
+    if array.shape != (4, 4) or np.isnan(array).any():
+        found = array.shape if array.shape != (4, 4) else "NaN"
+        raise ObservationsError(where=name, expected="16 finite numbers of shape (4, 4)", found=found)
+    check_rigid(array, name, ObservationsError)
+    baseline_mm = float(np.linalg.norm(array[:3, 3]))
+    if 0 < baseline_mm < 0.1:
+        raise ObservationsError(METRES, where=name, expected="a baseline in mm", found=f"{baseline_mm:g}")
+    return array
+
+
+def _flags(name: str, value: Any, n: int) -> np.ndarray:
+    if value is None:
+        return np.ones(n, dtype=bool)
+    array = np.asarray(value)
+    if array.shape != (n,):
+        raise ObservationsError(where=name, expected=f"shape {(n,)}", found=array.shape)
+    if array.dtype.kind not in "biu" or not np.isin(array, (0, 1)).all():
+        raise ObservationsError(where=name, expected="true or false", found=f"dtype {array.dtype} with other values")
+    return array.astype(bool)
+
+
+def _finite(array: np.ndarray) -> np.ndarray:
+    """(N,): rows without a NaN (nothing is infinite). A sum along the row: ten times faster than `isfinite.all`."""
+    flat = array.reshape(len(array), -1)
+    return ~np.isnan(flat @ np.ones(flat.shape[1]))
+
+
+def _mask_side(arrays: Arrays, side: str, valid: np.ndarray) -> np.ndarray:
+    """Blank what does not count in one image; returns where anything is left."""
+    measured = np.zeros_like(valid)
+    for kind in _MEASURED:
+        name = f"{kind}_{side}"
+        if name not in arrays:
+            continue
+        counts = valid & _finite(arrays[name])
+        if kind in ("end", "head"):
+            counts &= _finite(arrays[_NEEDS[kind]])
+        arrays[name][~counts] = np.nan
+        measured |= counts
+    return measured
+
+
+def _check_kinematics(arrays: Arrays) -> None:
+    T, v = arrays["arm_T_rcm"], arrays["rcm_v_axis"]
+    known = np.flatnonzero(_finite(T))
+    check_rigid(T[known], "arm_T_rcm", ObservationsError, known)
+    norm = np.linalg.norm(v, axis=1)
+    _refuse("rcm_v_axis", np.abs(norm - 1) > _UNIT_TOLERANCE, "a unit vector", lambda i: f"length {norm[i]:.6g}")
+    lengths = {"arm_T_rcm": T[:, :3, 3]} | {key: arrays[key] for key in ("rcm_p_head", "rcm_s_end_mm") if key in arrays}
+    for name, values in lengths.items():
+        largest = np.nanmax(np.abs(values), initial=0.0)
+        if 0 < largest < 1.0:
+            found = f"nothing above {largest:.3g}"
+            raise ObservationsError(METRES, where=name, expected="lengths in mm", found=found)
+
+
+def _check_image(arrays: Arrays, side: str) -> None:
+    for kind in _MEASURED:
+        name, array = f"{kind}_{side}", arrays.get(f"{kind}_{side}")
+        if array is None:
+            continue
+        seen = np.abs(array[np.isfinite(array)])
+        if len(seen) and np.median(seen) > _MAX_MEDIAN_COORDINATE:
+            found = f"a median of {np.median(seen):.4g}"
+            raise ObservationsError("looks like pixels", where=name, expected="normalised x/z, y/z", found=found)
+        if kind in ("axis", "contour"):
+            points = array.reshape(len(array), -1, 2, 2)
+            same = (points[:, :, 0] == points[:, :, 1]).all(axis=-1).any(axis=-1)
+            _refuse(name, same, "two points that differ", lambda i, p=points: f"{p[i, 0, 0].tolist()} twice")
+        if kind == "contour":
+            same = (array[:, 0] == array[:, 1]).all(axis=(1, 2))
+            _refuse(name, same, "two edges that differ", lambda i: "one edge twice")
+
+
+def _refuse(name: str, bad: np.ndarray, expected: str, found: Callable[[int], str]) -> None:
+    if bad.any():
+        i = int(bad.argmax())
+        raise ObservationsError(where=f"{name}[{i}]", expected=expected, found=found(i))

@@ -1,0 +1,171 @@
+"""Shaft observations: the solver's own input, as arrays in memory and as an .npz file (DESIGN.md 6.2)."""
+
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rmis_calib.errors import FileError, ObservationsError
+from rmis_calib.io import _observation_checks as checks
+from rmis_calib.io.atomic import atomic_write
+from rmis_calib.io.configs import did_you_mean
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ShaftObservations:
+    """What was seen of the shaft in N motions, and where the kinematics say that it was.
+
+    Image points are normalised and undistorted (x/z, y/z). Given arrays are copied as float64. After construction
+    validity and finiteness are one: a row that holds a NaN, or whose motion is not valid in that camera, is NaN
+    throughout, and `valid_right` and `valid_left` say in which motions a camera measured anything at all.
+
+    Raises:
+        ObservationsError: a shape, dtype or unit that cannot be right, infinity, a rotation that is not one, a
+            direction that is not unit, two points of a line that coincide, a sigma that is not positive, or an array
+            without another that it needs.
+    """
+
+    arm_T_rcm: np.ndarray
+    """(N, 4, 4), mm."""
+    rcm_v_axis: np.ndarray
+    """(N, 3), unit, RCM towards tip."""
+    axis_right: np.ndarray
+    """(N, 2, 2): [point (RCM side first), xy] of the axis line."""
+    axis_left: np.ndarray | None = None
+    """(N, 2, 2)."""
+    camera_left_T_camera_right: np.ndarray | None = None
+    """(4, 4), mm; needed by every left array."""
+    contour_right: np.ndarray | None = None
+    """(N, 2, 2, 2): [edge, point (RCM side first), xy]; needs `shaft_radius_mm`."""
+    contour_left: np.ndarray | None = None
+    """(N, 2, 2, 2)."""
+    shaft_radius_mm: float | None = None
+    end_right: np.ndarray | None = None
+    """(N, 2): where the shaft ends, on its axis; needs `rcm_s_end_mm`."""
+    end_left: np.ndarray | None = None
+    """(N, 2)."""
+    rcm_s_end_mm: np.ndarray | None = None
+    """(N,): nominal distance of the shaft's end from the RCM along the axis, known up to one constant."""
+    head_right: np.ndarray | None = None
+    """(N, 2): the head point; needs `rcm_p_head`."""
+    head_left: np.ndarray | None = None
+    """(N, 2)."""
+    rcm_p_head: np.ndarray | None = None
+    """(N, 3), mm."""
+    valid_right: np.ndarray | None = None
+    """(N,) bool; after construction always an array."""
+    valid_left: np.ndarray | None = None
+    """(N,) bool; None where there is no left array."""
+    sigma_image: float | None = None
+    """One sigma of a point across its line, normalised units."""
+    sigma_kinematics_mm: float | None = None
+    """Per axis, of `arm_T_rcm`, right perturbation."""
+    sigma_kinematics_rad: float | None = None
+    sigma_camera_mm: float | None = None
+    """Per axis, of the pose that each camera sees."""
+    sigma_camera_rad: float | None = None
+    sigma_stereo_mm: float | None = None
+    """Per axis, of `camera_left_T_camera_right`."""
+    sigma_stereo_rad: float | None = None
+    sigma_axis_right: np.ndarray | None = None
+    """(N,): one sigma of both points across the line, normalised units; NaN: `sigma_image`. The others likewise."""
+    sigma_axis_left: np.ndarray | None = None
+    """(N,)."""
+    sigma_contour_right: np.ndarray | None = None
+    """(N, 2), per edge."""
+    sigma_contour_left: np.ndarray | None = None
+    """(N, 2)."""
+    sigma_end_right: np.ndarray | None = None
+    """(N,), along the axis."""
+    sigma_end_left: np.ndarray | None = None
+    """(N,)."""
+    sigma_head_right: np.ndarray | None = None
+    """(N,), per coordinate."""
+    sigma_head_left: np.ndarray | None = None
+    """(N,)."""
+
+    def __post_init__(self) -> None:
+        given = {name: getattr(self, name) for name in OBSERVATION_KEYS if getattr(self, name) is not None}
+        for name, value in checks.canonical(given).items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def n_motions(self) -> int:
+        """N, valid or not."""
+        return len(self.arm_T_rcm)
+
+    @property
+    def has_left(self) -> bool:
+        """Whether there is any measurement in a left camera."""
+        return self.valid_left is not None
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """What is present, by the keys of the file; scalars as 0-d arrays."""
+        present = {name: getattr(self, name) for name in OBSERVATION_KEYS}
+        return {name: np.asarray(value) for name, value in present.items() if value is not None}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, Any]) -> "ShaftObservations":
+        """Observations from arrays by the keys of the file.
+
+        Raises:
+            ObservationsError: a key is unknown or missing, or an array is wrong.
+        """
+        for name in arrays:
+            if name not in OBSERVATION_KEYS:
+                found = f"an unknown one{did_you_mean(name, list(OBSERVATION_KEYS))}"
+                raise ObservationsError(where=f"key {name!r}", expected="a known key", found=found)
+        missing = [name for name in checks.REQUIRED if name not in arrays]
+        if missing:
+            expected = f"keys {', '.join(checks.REQUIRED)}"
+            raise ObservationsError(where="observations", expected=expected, found=f"no {', '.join(missing)}")
+        return cls(**arrays)
+
+    @classmethod
+    def load(cls, path: str | Path) -> "ShaftObservations":
+        """Read an .npz file.
+
+        Raises:
+            FileError: the file is absent or unreadable.
+            ObservationsError: it is truncated, of another kind, or an array in it is wrong.
+        """
+        arrays = _read_npz(Path(path))
+        try:
+            return cls.from_arrays(arrays)
+        except ObservationsError as error:
+            raise ObservationsError(str(error), where=str(path)) from error
+
+    def save(self, path: str | Path) -> None:
+        """Write an .npz file, whole or not at all.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        with atomic_write(path) as temporary, temporary.open("wb") as file:
+            np.savez(file, **self.to_arrays())  # pyright: ignore[reportArgumentType]
+
+
+OBSERVATION_KEYS: tuple[str, ...] = tuple(field.name for field in fields(ShaftObservations))
+
+
+def _read_npz(path: Path) -> dict[str, np.ndarray]:
+    try:
+        with path.open("rb") as file:
+            if not zipfile.is_zipfile(file):
+                found = "an empty file (0 bytes)" if path.stat().st_size == 0 else "another kind of file, or a cut one"
+                raise ObservationsError(where=str(path), expected="a complete .npz archive", found=found)
+            file.seek(0)
+            with np.load(file, allow_pickle=False) as archive:
+                return {name: archive[name] for name in archive.files}
+    except OSError as error:
+        found = "nothing there" if isinstance(error, FileNotFoundError) else error.strerror
+        raise FileError(where=str(path), expected="a readable .npz archive", found=found) from error
+    except ObservationsError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, NotImplementedError) as error:
+        found = f"a damaged one ({' '.join(str(error).split())})"
+        raise ObservationsError(where=str(path), expected="a complete .npz archive", found=found) from error
