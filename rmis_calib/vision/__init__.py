@@ -1,0 +1,14 @@
+"""Finding instrument shafts in pictures: contour lines, axis and end, with uncertainty."""
+
+from rmis_calib._lazy import lazy_exports
+
+__getattr__, __dir__, __all__ = lazy_exports(
+    __name__,
+    {
+        "DetectorSettings": ".settings",
+        "FrameReason": ".reasons",
+        "ShaftDetections": ".shaft_lines",
+        "ShaftDetector": ".shaft_lines",
+        "draw_detections": ".overlay",
+    },
+)

@@ -1,0 +1,174 @@
+"""Sub-pixel contour points at full resolution, in a narrow band along both traced contours.
+
+Profiles are read across the contour, projected on the colour that separates the two sides, and compared with a blurred
+step: level, height, place of the step and one slope on each side, because neither shaft nor tissue is of one tone. The
+step's blur is found once a contour from the mean profile; then the place of every step is one small matrix product.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from rmis_calib.vision.lens import Lens
+from rmis_calib.vision.sampling import inside, sample
+from rmis_calib.vision.strips import Strips
+
+# Blurs tried, in steps of the profile: from sharper than a pixel to soft motion blur.
+_BLURS = (0.5, 0.7, 0.95, 1.3, 1.8, 2.5, 3.4)
+# Prior on the slope of either side, in step heights a profile step: shading changes by less than a tenth of the contrast.
+_SLOPE_PRIOR = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class EdgePoints:
+    """Contour points of each strip: station and lateral place, full-resolution ideal px."""
+
+    t: Float[Tensor, "b k p"]
+    lateral: Float[Tensor, "b k 2 p"]
+    valid: Bool[Tensor, "b k 2 p"]
+    height: Float[Tensor, "b k 2 p"]
+    """Step across the contour along the separating colour, fraction of full scale."""
+    blur_px: Float[Tensor, "b k 2"]
+    """Standard deviation of the blur of the step."""
+
+
+def place_samples(on: Bool[Tensor, "b k s"], t: Float[Tensor, " s"], count: int) -> Float[Tensor, "b k p"]:
+    """Stations spread evenly over the stretches that are on."""
+    share = on.to(t.dtype).cumsum(-1)
+    total = share[..., -1:].clamp(min=1.0)
+    target = (torch.arange(count, device=t.device, dtype=t.dtype) + 0.5) / count * total
+    after = torch.searchsorted(share.contiguous(), target.contiguous()).clamp(max=t.shape[0] - 1)
+    within = target - (share.gather(-1, after) - 1.0)
+    return t[after] + (within - 0.5) * (t[1] - t[0])
+
+
+def at_stations(mask: Bool[Tensor, "b k s"], t: Float[Tensor, " s"], at: Float[Tensor, "b k p"]) -> Bool[Tensor, "b k p"]:
+    """The value of a mask at the nearest station."""
+    return mask.gather(-1, ((at - t[0]) / (t[1] - t[0])).round().long().clamp(0, t.shape[0] - 1))
+
+
+def interpolate(values: Float[Tensor, "b k 2 s"], t: Float[Tensor, " s"], at: Float[Tensor, "b k p"]) -> Tensor:
+    """Linear interpolation of per-station values, (b, k, 2, p)."""
+    place = ((at - t[0]) / (t[1] - t[0])).clamp(0, t.shape[0] - 1.001)[:, :, None].expand(-1, -1, 2, -1)
+    low = place.floor().long()
+    first, second = values.gather(-1, low), values.gather(-1, low + 1)
+    return first + (second - first) * (place - low)
+
+
+def _read_bands(
+    image: Float[Tensor, "b 3 h w"],
+    lens: Lens,
+    strips: Strips,
+    t: Float[Tensor, "b k p"],
+    lateral: Float[Tensor, "b k 2 p"],
+    offsets: Float[Tensor, "b k 2 d"],
+) -> tuple[Float[Tensor, "b k 2 p d 3"], Bool[Tensor, "b k 2 p"]]:
+    """Colours across each contour, from inside (first) to outside (last), and whether all of it is in the picture."""
+    outward = lateral.new_tensor([1.0, -1.0])[:, None, None]
+    y = lateral[..., None] + outward * offsets[:, :, :, None, :]
+    ideal = strips.points(t[:, :, None, :, None].expand_as(y), y)
+    raw = lens.to_raw(ideal)
+    return sample(image, raw), inside(raw, (image.shape[-2], image.shape[-1])).all(-1)
+
+
+def _project(colours: Float[Tensor, "b k 2 p d 3"], use: Bool[Tensor, "b k 2 p"]) -> Float[Tensor, "b k 2 p d"]:
+    """Colours along the direction, unit length, that separates outside from inside of each contour."""
+    third = colours.shape[-2] // 3
+    contrast = colours[..., -third:, :].mean(-2) - colours[..., :third, :].mean(-2)
+    weight = use[..., None].to(colours.dtype)
+    direction = (contrast * weight).sum(-2)
+    direction = direction / direction.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+    return torch.einsum("bkepdc,bkec->bkepd", colours, direction)
+
+
+def _steepest(profile: Float[Tensor, "b k 2 p d"]) -> tuple[Float[Tensor, "b k 2 p"], Float[Tensor, "b k 2 p"]]:
+    """Place of the steepest rise, in profile steps from the middle, and the rise of a smoothed profile there."""
+    size = profile.shape[-1]
+    kernel = profile.new_tensor([-1.0, -2.0, 0.0, 2.0, 1.0]) / 8
+    slope = profile.unfold(-1, 5, 1) @ kernel
+    best = slope.argmax(-1, keepdim=True)
+    inner = best.clamp(1, slope.shape[-1] - 2)
+    before, here, after = (slope.gather(-1, inner + shift)[..., 0] for shift in (-1, 0, 1))
+    bend = (2 * here - before - after).clamp(min=1e-9)
+    top = inner[..., 0] + (0.5 * (after - before) / bend).clamp(-0.5, 0.5)
+    return top + 2 - (size - 1) / 2, here
+
+
+def rough(
+    image: Float[Tensor, "b 3 h w"], lens: Lens, strips: Strips, t: Tensor, lateral: Tensor, step_px: Float[Tensor, "b k 2"]
+) -> EdgePoints:
+    """Steepest rise within eight steps of the traced contour; its softness sets the step of `fine`."""
+    offsets = torch.arange(-8, 9, device=t.device, dtype=t.dtype) * step_px[..., None]
+    colours, seen = _read_bands(image, lens, strips, t, lateral, offsets)
+    profile = _project(colours, seen)
+    place, slope = _steepest(profile)
+    height = profile[..., -4:].mean(-1) - profile[..., :4].mean(-1)
+    outward = t.new_tensor([1.0, -1.0])[:, None]
+    blur = (height / slope.clamp(min=1e-4) / 2.5066).clamp(0.4, 6.0).median(-1).values * step_px
+    valid = seen & (slope > 0.25 * slope.median(-1, keepdim=True).values) & (slope > 2e-3)
+    return EdgePoints(t, lateral + outward * place * step_px[..., None], valid, height, blur)
+
+
+def fine(
+    image: Float[Tensor, "b 3 h w"],
+    lens: Lens,
+    strips: Strips,
+    t: Float[Tensor, "b k p"],
+    lateral: Float[Tensor, "b k 2 p"],
+    step_px: Float[Tensor, "b k 2"],
+) -> EdgePoints:
+    """Place of a blurred step in each profile, by linear least squares around `lateral`."""
+    offsets = torch.arange(-6, 7, device=t.device, dtype=t.dtype)
+    colours, seen = _read_bands(image, lens, strips, t, lateral, offsets * step_px[..., None])
+    profile = _project(colours, seen)
+    blur = _mean_blur(profile, seen, offsets)
+    solve = step_estimator(offsets, blur)  # (b, k, 2, 5, d)
+    fit = torch.einsum("bkend,bkepd->bkepn", solve, profile)
+    height = fit[..., 1]
+    usual = height.median(-1, keepdim=True).values
+    shift = -fit[..., 2] / height.clamp(min=1e-3)
+    limit = 2.5 * blur[..., None]
+    valid = seen & (height > 0.3 * usual) & (height > 5e-3) & (shift.abs() < limit)
+    outward = t.new_tensor([1.0, -1.0])[:, None]
+    place = lateral + outward * shift.clamp(-limit, limit) * step_px[..., None]
+    return EdgePoints(t, place, valid, height, blur * step_px)
+
+
+def _step_columns(offsets: Float[Tensor, " d"], blur: Float[Tensor, "*b"]) -> Float[Tensor, "*b d 5"]:
+    """Columns: level, step, derivative of the step by its place (negated), slope inside, slope outside."""
+    z = offsets / blur[..., None]
+    step = torch.special.ndtr(z)
+    bell = torch.exp(-0.5 * z * z) / (2.5066283 * blur[..., None])
+    ramp = offsets * step + blur[..., None] ** 2 * bell  # integral of the step: the outer side's blurred slope
+    return torch.stack([torch.ones_like(step), step, bell, ramp - offsets, ramp], -1)
+
+
+def step_estimator(offsets: Float[Tensor, " d"], blur: Float[Tensor, "*b"]) -> Float[Tensor, "*b 5 d"]:
+    """Least-squares solution as a matrix, with a weak prior that slopes are small and a window around the step."""
+    columns = _step_columns(offsets, blur)
+    reach = (3.0 * blur + 1.5)[..., None]
+    window = torch.exp(-0.5 * (offsets / reach) ** 4)[..., None]
+    weighted = (columns * window).mT
+    prior = torch.diag(offsets.new_tensor([0.0, 0.0, 0.0, 1.0, 1.0])) * 0.5
+    return torch.linalg.solve(weighted @ columns + prior, weighted)
+
+
+def _mean_blur(
+    profile: Float[Tensor, "b k 2 p d"], use: Bool[Tensor, "b k 2 p"], offsets: Float[Tensor, " d"]
+) -> Float[Tensor, "b k 2"]:
+    """Blur, in steps, that explains the mean profile best; from a bank, with a parabola between its members."""
+    weight = use[..., None].to(profile.dtype)
+    mean = (profile * weight).sum(-2) / weight.sum(-2).clamp(min=1.0)
+    bank = offsets.new_tensor(_BLURS)
+    columns = _step_columns(offsets, bank)  # (n, d, 5)
+    fit = torch.linalg.pinv(columns)
+    residual = mean[..., None, :] - torch.einsum("ndc,nce,bkse->bksnd", columns, fit, mean)
+    misfit = (residual**2).sum(-1)
+    best = misfit.argmin(-1, keepdim=True).clamp(1, len(_BLURS) - 2)
+    before, here, after = (misfit.gather(-1, best + shift)[..., 0] for shift in (-1, 0, 1))
+    shift = (0.5 * (before - after) / (before + after - 2 * here).clamp(min=1e-12)).clamp(-1.0, 1.0)
+    log_bank = bank.log()
+    low = log_bank[best[..., 0]]
+    return (low + shift * torch.where(shift > 0, log_bank[best[..., 0] + 1] - low, low - log_bank[best[..., 0] - 1])).exp()

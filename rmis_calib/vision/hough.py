@@ -1,0 +1,122 @@
+"""Hough voting in torch: edge pixels vote for lines, the direction of their gradient narrows the votes to a few angles.
+
+A line is (normal angle, signed distance): n . x = rho with n = (cos theta, sin theta) pointing to the *outer* side, where
+the picture is less like a shaft. Theta covers the full turn, so the two contours of a shaft are half a turn apart and a
+line knows on which of its sides the shaft would be.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from kornia.filters import spatial_gradient
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, max_pool2d, pad
+
+_ANGLES = 240
+_RHO_STEP_PX = 1.5
+_ANGLE_SPREAD = 3
+"""Each pixel votes for 2 * 3 + 1 angles of 1.5 degrees: sobel gradients on a small picture are good to about 3 degrees."""
+
+
+@dataclass(frozen=True, eq=False)
+class EdgePixels:
+    """Pixels of a batch that lie on an edge, as one flat list."""
+
+    frame: Tensor
+    """Index of the frame, (m,) int64."""
+    uv: Float[Tensor, "m 2"]
+    """Ideal pixel coordinates, relative to the centre that `vote` uses."""
+    normal: Float[Tensor, "m 2"]
+    """Unit, towards the outer side."""
+    weight: Float[Tensor, " m"]
+    """Vote, 0 to 1."""
+
+
+@dataclass(frozen=True, eq=False)
+class HoughLines:
+    """The strongest lines of each frame."""
+
+    normal: Float[Tensor, "b p 2"]
+    """Unit, towards the outer side."""
+    rho: Float[Tensor, "b p"]
+    """Distance from the centre along the normal, small px."""
+    votes: Float[Tensor, "b p"]
+    """Weighted votes; 0 pads frames with fewer lines."""
+
+
+def gradients(unlike: Float[Tensor, "b h w"]) -> Float[Tensor, "b 2 h w"]:
+    """Sobel gradient (d/du, d/dv), per pixel."""
+    return spatial_gradient(unlike[:, None], mode="sobel", order=1, normalized=True)[:, 0]
+
+
+def thin(magnitude: Float[Tensor, "b h w"], gradient: Float[Tensor, "b 2 h w"]) -> Bool[Tensor, "b h w"]:
+    """Pixels whose gradient is the largest along its own direction (of four)."""
+    padded = pad(magnitude[:, None], (1, 1, 1, 1))[:, 0]
+    height, width = magnitude.shape[1:]
+
+    def neighbour(du: int, dv: int) -> Tensor:
+        return padded[:, 1 + dv : 1 + dv + height, 1 + du : 1 + du + width]
+
+    gu, gv = gradient.unbind(1)
+    flat, steep = gv.abs() < 0.4142 * gu.abs(), gu.abs() < 0.4142 * gv.abs()
+    rising = gu * gv > 0
+    ahead = torch.where(rising, neighbour(1, 1), neighbour(1, -1))
+    behind = torch.where(rising, neighbour(-1, -1), neighbour(-1, 1))
+    ahead = torch.where(flat, neighbour(1, 0), torch.where(steep, neighbour(0, 1), ahead))
+    behind = torch.where(flat, neighbour(-1, 0), torch.where(steep, neighbour(0, -1), behind))
+    return (magnitude >= ahead) & (magnitude > behind)
+
+
+def vote(edges: EdgePixels, frames: int, radius_px: float) -> Float[Tensor, "b angles rhos"]:
+    """Accumulator of weighted votes.
+
+    Args:
+        edges: coordinates relative to the centre of the picture.
+        frames: size of the batch.
+        radius_px: largest |rho|.
+    """
+    rhos = 2 * math.ceil(radius_px / _RHO_STEP_PX) + 3
+    step = 2 * math.pi / _ANGLES
+    own = torch.atan2(edges.normal[:, 1], edges.normal[:, 0]) / step
+    offsets = torch.arange(-_ANGLE_SPREAD, _ANGLE_SPREAD + 1, device=own.device)
+    angle = own.round().long()[:, None] + offsets  # (m, 7)
+    share = (1 - (angle - own[:, None]).abs() / (_ANGLE_SPREAD + 1)).clamp(min=0.0) * edges.weight[:, None]
+    angle = angle % _ANGLES
+    theta = angle.to(own.dtype) * step
+    rho = edges.uv[:, :1] * theta.cos() + edges.uv[:, 1:] * theta.sin()
+    at = (rho / _RHO_STEP_PX + rhos // 2).clamp(0, rhos - 1.001)
+    low = at.floor()
+    cell = (edges.frame[:, None] * _ANGLES + angle) * rhos + low.long()
+    votes = share.new_zeros(frames * _ANGLES * rhos)
+    votes.index_add_(0, cell.reshape(-1), (share * (1 - at + low)).reshape(-1))
+    votes.index_add_(0, (cell + 1).reshape(-1), (share * (at - low)).reshape(-1))
+    return votes.reshape(frames, _ANGLES, rhos)
+
+
+def peaks(votes: Float[Tensor, "b angles rhos"], count: int) -> HoughLines:
+    """The `count` strongest local maxima of each frame, refined to a fraction of a bin."""
+    frames, angles, rhos = votes.shape
+    around = torch.cat([votes[:, -3:], votes, votes[:, :3]], 1)  # the angle closes on itself
+    smooth = avg_pool2d(pad(around[:, None], (1, 1, 0, 0)), 3, stride=1)[:, 0, 2:-2]
+    wide = torch.cat([smooth[:, -3:], smooth, smooth[:, :3]], 1)
+    highest = max_pool2d(pad(wide[:, None], (2, 2, 0, 0)), (7, 5), stride=1)[:, 0]
+    score = torch.where(smooth[:, : angles] >= highest[:, : angles], smooth[:, : angles], 0.0)
+    best = score.reshape(frames, -1).topk(count, dim=1)
+    angle, rho = best.indices // rhos, best.indices % rhos
+    flat = smooth.reshape(frames, -1)
+
+    def at(da: int, dr: int) -> Tensor:
+        index = ((angle + da) % angles) * rhos + (rho + dr).clamp(0, rhos - 1)
+        return flat.gather(1, index)
+
+    theta = (angle + _vertex(at(-1, 0), at(0, 0), at(1, 0))) * (2 * math.pi / angles)
+    distance = (rho + _vertex(at(0, -1), at(0, 0), at(0, 1)) - rhos // 2) * _RHO_STEP_PX
+    return HoughLines(torch.stack([theta.cos(), theta.sin()], -1), distance, best.values)
+
+
+def _vertex(before: Tensor, here: Tensor, after: Tensor) -> Tensor:
+    """Where the parabola through three equidistant values has its top, in steps, within half a step."""
+    bend = (2 * here - before - after).clamp(min=1e-9)
+    return (0.5 * (after - before) / bend).clamp(-0.5, 0.5)

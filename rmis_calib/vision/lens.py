@@ -1,0 +1,56 @@
+"""Ideal pixels: where a pinhole camera without distortion would have drawn a point of the raw picture.
+
+Contours are straight only after undistortion. The picture itself is never resampled: edge coordinates are moved to ideal
+pixels, lines live there, and samples are read at the raw pixel that belongs to an ideal one.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rmis_calib.geometry import Camera
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Raw <-> ideal <-> normalised coordinates; without a camera, all three are pixels."""
+
+    camera: Camera | None
+
+    @property
+    def distorts(self) -> bool:
+        """Whether raw and ideal pixels differ."""
+        return self.camera is not None and bool(torch.any(self.camera.distortion != 0))
+
+    @property
+    def focal_px(self) -> float:
+        """Mean focal length; 1 without a camera, so that normalised units are pixels."""
+        return 1.0 if self.camera is None else float(self.camera.focal)
+
+    def _intrinsics(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        if self.camera is None:
+            return like.new_ones(2), like.new_zeros(2)
+        focal = torch.stack([self.camera.fx, self.camera.fy]).to(like)
+        return focal, torch.stack([self.camera.cx, self.camera.cy]).to(like)
+
+    def normalise(self, ideal: Float[Tensor, "*points 2"]) -> Float[Tensor, "*points 2"]:
+        """Ideal pixels to normalised undistorted coordinates (x/z, y/z)."""
+        focal, centre = self._intrinsics(ideal)
+        return (ideal - centre) / focal
+
+    def to_raw(self, ideal: Float[Tensor, "*points 2"]) -> Float[Tensor, "*points 2"]:
+        """Ideal pixels to raw pixels."""
+        if self.camera is None or not self.distorts:
+            return ideal
+        camera = self.camera.to(dtype=ideal.dtype, device=ideal.device)
+        return camera.pixels(self.normalise(ideal))
+
+    def to_ideal(self, raw: Float[Tensor, "*points 2"]) -> Float[Tensor, "*points 2"]:
+        """Raw pixels to ideal pixels; NaN where the distortion has no inverse."""
+        if self.camera is None or not self.distorts:
+            return raw
+        focal, centre = self._intrinsics(raw)
+        xy, valid = self.camera.to(dtype=raw.dtype, device=raw.device).undistort_points(raw)
+        return torch.where(valid[..., None], xy * focal + centre, torch.nan)

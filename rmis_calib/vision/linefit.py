@@ -1,0 +1,89 @@
+"""Robust straight lines through contour points, with an honest uncertainty."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+_ITERATIONS = 12
+_BLOCKS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class LineFit:
+    """y = offset + slope * t, and how well the points agree with it."""
+
+    offset: Float[Tensor, "*b"]
+    slope: Float[Tensor, "*b"]
+    centre_t: Float[Tensor, "*b"]
+    """Weighted mean station: there, offset and slope errors are uncorrelated."""
+    spread_t: Float[Tensor, "*b"]
+    """Weighted rms of the stations about their mean."""
+    scatter_px: Float[Tensor, "*b"]
+    """Robust standard deviation of one point."""
+    sigma_px: Float[Tensor, "*b"]
+    """Standard deviation of the line at centre_t - spread_t and at centre_t + spread_t, each."""
+    inliers: Float[Tensor, "*b"]
+    """Number of points that carry the line."""
+
+
+def fit_lines(
+    t: Float[Tensor, "*b p"],
+    y: Float[Tensor, "*b p"],
+    weight: Float[Tensor, "*b p"],
+    trusted: Bool[Tensor, "*b p"],
+    floor_px: float,
+) -> LineFit:
+    """Lines by reweighted least squares (Huber, then Tukey's biweight on a robust scale).
+
+    The uncertainty is the larger of what independent points give and what the means of twelve consecutive blocks
+    say: texture, glare and a bent shaft move neighbours together.
+
+    Args:
+        t: stations, px.
+        y: lateral places, px.
+        weight: prior weight of each point, 0 for none.
+        trusted: points that set the first lines and the scale; the others join where they agree.
+        floor_px: smallest standard deviation of one point.
+    """
+    robust = weight * trusted
+    scale = torch.full(t.shape[:-1], 1e3, dtype=t.dtype, device=t.device)
+    for step in range(_ITERATIONS):
+        offset, slope, centre, spread = _solve(t, y, robust)
+        residual = y - offset[..., None] - slope[..., None] * t
+        size = torch.where((weight > 0) & trusted, residual.abs(), torch.nan)
+        scale = torch.nan_to_num(1.4826 * size.nanmedian(-1).values).clamp(min=floor_px)
+        z = residual / scale[..., None]
+        tukey = (1 - (z / 4.7).square()).clamp(min=0.0).square()
+        huber = 1.3 / z.abs().clamp(min=1.3)
+        robust = weight * (huber * trusted if step < 5 else tukey)
+    inliers = robust.sum(-1).square() / robust.square().sum(-1).clamp(min=1e-9)
+    scatter = ((robust * residual.square()).sum(-1) / robust.sum(-1).clamp(min=1e-9)).sqrt().clamp(min=floor_px)
+    independent = scatter * (2.0 / inliers.clamp(min=3.0)).sqrt()
+    together = _block_sigma(residual, robust, (t - centre[..., None]) / spread[..., None].clamp(min=1e-6))
+    sigma = torch.maximum(independent, together)
+    return LineFit(offset, slope, centre, spread, scatter, sigma, (robust > 0.1 * weight.clamp(min=1e-9)).sum(-1).to(t.dtype))
+
+
+def _solve(t: Tensor, y: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    total = weight.sum(-1).clamp(min=1e-9)
+    centre = (weight * t).sum(-1) / total
+    mean = (weight * y).sum(-1) / total
+    dt = t - centre[..., None]
+    variance = (weight * dt.square()).sum(-1) / total
+    slope = (weight * dt * y).sum(-1) / total / variance.clamp(min=1e-9)
+    return mean - slope * centre, slope, centre, variance.sqrt()
+
+
+def _block_sigma(
+    residual: Float[Tensor, "*b p"], weight: Float[Tensor, "*b p"], lever: Float[Tensor, "*b p"]
+) -> Float[Tensor, "*b"]:
+    """Standard deviation of the line's value at either end point, from sums of weighted residuals over blocks."""
+    blocks = (*residual.shape[:-1], _BLOCKS, residual.shape[-1] // _BLOCKS)
+    used = blocks[-1] * _BLOCKS
+    total = weight.sum(-1).clamp(min=1e-9)
+    influence = weight * residual / total[..., None]
+    means = influence[..., :used].reshape(blocks).sum(-1)
+    tilts = (influence * lever)[..., :used].reshape(blocks).sum(-1)
+    return (means.square().sum(-1) + tilts.square().sum(-1)).sqrt()

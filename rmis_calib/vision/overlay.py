@@ -1,0 +1,79 @@
+"""Pictures that show what was detected, for reports and for the eye."""
+
+import cv2
+import numpy as np
+import torch
+
+from rmis_calib.vision.shaft_lines import ShaftDetections
+
+_EDGE_COLOURS = ((255, 196, 0), (0, 214, 255), (170, 255, 90))
+"""Amber, cyan, green: best, second, third shaft. All legible on red tissue, pink phantom and dark lab."""
+_END_COLOUR = (255, 60, 220)
+_PREDICTED_COLOUR = (255, 255, 255)
+_SHIFT = 4
+
+
+def draw_detections(
+    image: np.ndarray, found: ShaftDetections, frame: int = 0, predicted_uv: np.ndarray | None = None, label: str = ""
+) -> np.ndarray:
+    """A copy of a picture with contours, middle lines and ends drawn on it.
+
+    Args:
+        image: (h, w, 3) uint8 RGB.
+        found: detections of a batch.
+        frame: which frame of the batch the picture is.
+        predicted_uv: polylines to compare with, (n, points, 2) raw px, drawn thin and white; NaN points break a line.
+        label: text for the top left corner.
+
+    Returns:
+        (h, w, 3) uint8 RGB.
+    """
+    canvas = np.ascontiguousarray(image.copy())
+    weight = max(1, round(image.shape[1] / 640))
+    if predicted_uv is not None:
+        for line in predicted_uv:
+            _polyline(canvas, np.asarray(line, float), _PREDICTED_COLOUR, 1)
+    for rank in range(found.valid.shape[1] - 1, -1, -1):
+        if not bool(found.valid[frame, rank]):
+            continue
+        colour = _EDGE_COLOURS[rank % len(_EDGE_COLOURS)]
+        contours = found.contour_uv[frame, rank].double().cpu().numpy()
+        for line in contours:
+            _polyline(canvas, line, (0, 0, 0), weight + 2)
+        for line in contours:
+            _polyline(canvas, line, colour, weight)
+        _polyline(canvas, contours.mean(0)[::2], colour, 1)
+        _end(canvas, contours, found, frame, rank, weight)
+        place = contours[0, contours.shape[1] // 2]
+        text = f"{float(found.confidence[frame, rank]):.2f}"
+        if np.isfinite(place).all():
+            _text(canvas, text, (int(place[0]) + 8, int(place[1]) - 8), colour)
+    if label:
+        _text(canvas, label, (10, 24), (255, 255, 255))
+    return canvas
+
+
+def _end(canvas: np.ndarray, contours: np.ndarray, found: ShaftDetections, frame: int, rank: int, weight: int) -> None:
+    """A bar across the shaft where it ends, and a dot on the axis."""
+    if not bool(found.end_valid[frame, rank]):
+        return
+    bar = torch.tensor(contours[:, -1]).numpy()
+    _polyline(canvas, bar, _END_COLOUR, weight)
+    centre = found.end_uv[frame, rank].double().cpu().numpy()
+    cv2.circle(canvas, _fixed(centre), (weight + 2) << _SHIFT, _END_COLOUR, -1, cv2.LINE_AA, _SHIFT)
+
+
+def _fixed(point: np.ndarray) -> tuple[int, int]:
+    return int(round(point[0] * (1 << _SHIFT))), int(round(point[1] * (1 << _SHIFT)))
+
+
+def _polyline(canvas: np.ndarray, points: np.ndarray, colour: tuple[int, int, int], weight: int) -> None:
+    limit = 4.0 * max(canvas.shape)
+    for a, b in zip(points[:-1], points[1:], strict=True):
+        if np.isfinite([a, b]).all() and np.abs([a, b]).max() < limit:
+            cv2.line(canvas, _fixed(a), _fixed(b), colour, weight, cv2.LINE_AA, _SHIFT)
+
+
+def _text(canvas: np.ndarray, text: str, place: tuple[int, int], colour: tuple[int, int, int]) -> None:
+    for shade, weight in (((0, 0, 0), 3), (colour, 1)):
+        cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, shade, weight, cv2.LINE_AA)

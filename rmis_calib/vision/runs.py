@@ -1,0 +1,74 @@
+"""Runs and masked statistics along the stations of a strip, for any leading batch."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import pad
+
+
+def run_lengths(on: Bool[Tensor, "*b s"]) -> Float[Tensor, "*b s"]:
+    """For every station, the number of stations in the unbroken run that it belongs to (0 where off)."""
+    label = _run_labels(on)
+    counts = torch.zeros(*on.shape[:-1], on.shape[-1] + 1, device=on.device)
+    counts.scatter_add_(-1, label, on.float())
+    return counts.gather(-1, label) * on
+
+
+def longest_run(on: Bool[Tensor, "*b s"]) -> Bool[Tensor, "*b s"]:
+    """The longest unbroken run (all of them where several are equally long)."""
+    lengths = run_lengths(on)
+    return on & (lengths == lengths.amax(-1, keepdim=True))
+
+
+def run_minimum(value: Float[Tensor, "*b s"], on: Bool[Tensor, "*b s"]) -> Float[Tensor, "*b s"]:
+    """For every station that is on, the smallest value of its run, blind to single dark stations; infinite where off."""
+    steady = pad(value, (1, 1), mode="replicate").unfold(-1, 3, 1).median(-1).values
+    steady = torch.where(on, steady, torch.inf)
+    label = _run_labels(on)
+    lowest = torch.full((*on.shape[:-1], on.shape[-1] + 1), torch.inf, device=on.device)
+    lowest.scatter_reduce_(-1, label, steady, "amin")
+    return torch.where(on, lowest.gather(-1, label), torch.inf)
+
+
+def _run_labels(on: Bool[Tensor, "*b s"]) -> Tensor:
+    """Number of the latest run begun at or before each station, from 1; 0 before the first."""
+    starts = on & ~torch.cat([torch.zeros_like(on[..., :1]), on[..., :-1]], -1)
+    return starts.cumsum(-1)
+
+
+def masked_mean(value: Float[Tensor, "*b s"], mask: Bool[Tensor, "*b s"]) -> Float[Tensor, "*b"]:
+    """Mean over the stations in the mask; 0 where there is none."""
+    return torch.where(mask, value, 0.0).sum(-1) / mask.sum(-1).clamp(min=1)
+
+
+def masked_median(value: Float[Tensor, "*b s"], mask: Bool[Tensor, "*b s"]) -> Float[Tensor, "*b"]:
+    """Median over the stations in the mask; 0 where there is none."""
+    return torch.nan_to_num(torch.where(mask, value, torch.nan).nanmedian(-1).values)
+
+
+def masked_quantile(value: Float[Tensor, "*b s"], mask: Bool[Tensor, "*b s"], share: float) -> Float[Tensor, "*b"]:
+    """Quantile over the stations in the mask; 0 where there is none."""
+    return torch.nan_to_num(torch.where(mask, value, torch.nan).nanquantile(share, dim=-1))
+
+
+def first_on(t: Float[Tensor, " s"], mask: Bool[Tensor, "*b s"]) -> Float[Tensor, "*b"]:
+    """Lowest station in the mask; 0 where there is none."""
+    low = torch.where(mask, t, torch.inf).amin(-1)
+    return torch.where(torch.isfinite(low), low, 0.0)
+
+
+def last_on(t: Float[Tensor, " s"], mask: Bool[Tensor, "*b s"]) -> Float[Tensor, "*b"]:
+    """Highest station in the mask; 0 where there is none."""
+    high = torch.where(mask, t, -torch.inf).amax(-1)
+    return torch.where(torch.isfinite(high), high, 0.0)
+
+
+def smooth_over(value: Float[Tensor, "*b s"], mask: Bool[Tensor, "*b s"]) -> Float[Tensor, "*b s"]:
+    """Median of five stations, then mean of five, of what lies in the mask; 0 where nothing does."""
+    holes = torch.where(mask, value, torch.nan)
+    windows = pad(holes, (2, 2), value=torch.nan).unfold(-1, 5, 1)
+    steady = windows.nanmedian(-1).values
+    weight = torch.isfinite(steady)
+    total = pad(torch.where(weight, steady, 0.0), (2, 2)).unfold(-1, 5, 1).sum(-1)
+    count = pad(weight.to(value.dtype), (2, 2)).unfold(-1, 5, 1).sum(-1)
+    return total / count.clamp(min=1.0)

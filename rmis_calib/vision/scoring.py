@@ -1,0 +1,164 @@
+"""What the small picture says for each strip: where along it both contours are there and the inside looks like a shaft."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from rmis_calib.vision.runs import first_on, last_on, masked_mean, masked_median, run_lengths
+from rmis_calib.vision.settings import DetectorSettings
+from rmis_calib.vision.strips import SmallPicture, Strips
+
+_STATIONS = 128
+_INNER, _RIM = 7, 4
+# A wrist of bare metal lies about half-way between shaft and tissue (0.5 to 0.7 in both da Vinci and grasper pictures);
+# shading along a shaft stays below 0.25.
+_SHAFT_SHARE = 0.38
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """The stretch of each strip that is a shaft, walked from the border of the picture to the tip."""
+
+    strips: Strips
+    t: Float[Tensor, " s"]
+    """Stations, px."""
+    on: Bool[Tensor, "b k s"]
+    """Both contours are there and the inside is of the shaft's own tone, in stretches long enough to count."""
+    start: Float[Tensor, "b k"]
+    """First station of the shaft, px."""
+    end: Float[Tensor, "b k"]
+    """Last station of the last stretch that is long enough to carry the end, px."""
+    start_at_border: Bool[Tensor, "b k"]
+    """The shaft enters the field of view here."""
+    end_at_border: Bool[Tensor, "b k"]
+    """The other end leaves it too: which one is the tip is not known."""
+    width: Float[Tensor, "b k"]
+    """Mean width, px."""
+    length: Float[Tensor, "b k"]
+    """Supported length, px."""
+    paired_length: Float[Tensor, "b k"]
+    """Length along which both contours are in the field of view, px."""
+    contrast: Float[Tensor, "b k"]
+    """Median over the shaft of the weaker contour's step."""
+    purity: Float[Tensor, "b k"]
+    """How much of the inside is shaft and how much of the surroundings is not, 0 to 1."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Profiles:
+    inner: Float[Tensor, "b k s"]
+    outer: Float[Tensor, "b k s"]
+    step: Float[Tensor, "b k s"]
+    purity: Float[Tensor, "b k s"]
+    open: Bool[Tensor, "b k s"]
+    both: Bool[Tensor, "b k s"]
+    seen: Bool[Tensor, "b k s"]
+    width: Float[Tensor, "b k s"]
+
+
+def _profiles(picture: SmallPicture, strips: Strips, t: Float[Tensor, " s"], narrowest_px: float) -> _Profiles:
+    """Read inside, just across both contours, and beyond them, at every station."""
+    stations = t.expand(*strips.valid.shape, t.shape[0])
+    edge = strips.contour(stations)
+    left, right = edge.unbind(2)
+    width = left - right
+    unit = float(picture.factor)
+    half = (0.5 * width - 1.5 * unit).clamp(min=0.25 * unit)
+    inner_y = 0.5 * (left + right)[..., None] + half[..., None] * torch.linspace(-1, 1, _INNER, device=t.device)
+    # Defocus and motion blur make the contours of a wide shaft several small pixels soft.
+    near = (0.07 * width).clamp(min=1.5 * unit)
+    rim_y = torch.stack([left + near, left - near, right + near, right - near], -1)
+    far = torch.stack([(0.2 * width).clamp(min=3 * unit), (0.4 * width).clamp(min=5 * unit)], -1)
+    beyond_y = torch.cat([left[..., None] + far, right[..., None] - far], -1)
+    lateral = torch.cat([inner_y, rim_y, beyond_y], -1)
+    value, seen = picture.read(strips.points(stations[..., None].expand_as(lateral), lateral))
+    rim, beyond = value[..., _INNER : _INNER + _RIM], value[..., _INNER + _RIM :]
+    inner = value[..., :_INNER].median(-1).values
+    inf = value.new_tensor(torch.inf)
+    rim_seen = seen[..., _INNER : _INNER + _RIM]
+    left_seen, right_seen = rim_seen[..., :2].all(-1), rim_seen[..., 2:].all(-1)
+    step = torch.minimum(
+        torch.where(left_seen, rim[..., 0] - rim[..., 1], inf), torch.where(right_seen, rim[..., 3] - rim[..., 2], inf)
+    )
+    outer = torch.minimum(torch.where(left_seen, rim[..., 0], inf), torch.where(right_seen, rim[..., 3], inf))
+    one_side, both_sides = left_seen | right_seen, left_seen & right_seen
+    middle = 0.5 * (inner + outer)[..., None]
+    free = (beyond > middle) | ~seen[..., _INNER + _RIM :]
+    purity = (value[..., :_INNER] < middle).float().mean(-1) * free.float().mean(-1)
+    centre_seen = seen[..., _INNER // 2]
+    is_open = centre_seen & one_side & (width > narrowest_px) & strips.valid[..., None]
+    return _Profiles(inner, outer, step, purity, is_open, both_sides, centre_seen, width)
+
+
+def inspect(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> Evidence:
+    """Find the stretch of each strip that is a shaft, and turn the strip so that it runs towards the tip."""
+    t = torch.linspace(-1, 1, _STATIONS, device=strips.offset.device) * picture.half_diagonal_px
+    spacing = float(t[1] - t[0])
+    p = _profiles(picture, strips, t, settings.min_width_fraction * picture.image_size[1])
+    on = p.open & (p.step > settings.min_contrast) & (p.inner < p.outer - 0.5 * settings.min_contrast)
+    tone = masked_median(p.inner, on)
+    surround = masked_median(p.outer, on)
+    on &= p.inner < (tone + _SHAFT_SHARE * (surround - tone).clamp(min=0.0))[..., None]
+    width = masked_mean(p.width, on)
+    length = run_lengths(on) * spacing
+    on &= length > (0.5 * width).clamp(min=2.5 * spacing)[..., None]
+    carries_end = on & (length > settings.end_run_widths * width[..., None])
+    carries_end = torch.where(carries_end.any(-1, keepdim=True), carries_end, on)
+
+    reach = 0.5 * width + 3 * spacing
+    low_gap = first_on(t, on) - first_on(t, p.seen)
+    high_gap = last_on(t, p.seen) - last_on(t, on)
+    low_border, high_border = low_gap < reach, high_gap < reach
+    flip = (high_border & ~low_border) | ((high_border == low_border) & (high_gap < low_gap))
+    start = torch.where(flip, -last_on(t, on), first_on(t, on))
+    end = torch.where(flip, -first_on(t, carries_end), last_on(t, carries_end))
+    return Evidence(
+        strips=strips.reverse(flip),
+        t=t,
+        on=torch.where(flip[..., None], on.flip(-1), on),
+        start=start,
+        end=end,
+        start_at_border=torch.where(flip, high_border, low_border),
+        end_at_border=torch.where(flip, low_border, high_border),
+        width=width,
+        length=on.float().sum(-1) * spacing,
+        paired_length=(on & p.both).float().sum(-1) * spacing,
+        contrast=masked_median(p.step, on),
+        purity=masked_mean(p.purity, on),
+    )
+
+
+def score(evidence: Evidence, settings: DetectorSettings) -> Float[Tensor, "b k"]:
+    """Supported length, px, discounted for weak contours, mixed insides or surroundings, and for not reaching a border."""
+    quality = evidence.contrast / (evidence.contrast + 0.3)
+    entering = torch.where(evidence.start_at_border, 1.0, 0.5)
+    long_enough = (evidence.length > settings.min_aspect * evidence.width) & (
+        evidence.paired_length > 0.5 * settings.min_aspect * evidence.width
+    )
+    return evidence.length * quality * evidence.purity**2 * entering * (long_enough & evidence.strips.valid)
+
+
+def distinct(evidence: Evidence, scores: Float[Tensor, "b k"], count: int) -> tuple[Tensor, Float[Tensor, "b c"]]:
+    """Indices and scores of the best `count` strips that do not lie on one another."""
+    strips = evidence.strips
+    middle = 0.5 * (evidence.start + evidence.end)
+    at = strips.points(middle[..., None], strips.contour(middle[..., None]).mean(2))[:, :, 0]  # (b, k, 2)
+    relative = at[:, None] - strips.origin[:, :, None]  # point of the second seen from the first
+    station = (relative * strips.along[:, :, None]).sum(-1)
+    lateral = (relative * strips.left[:, :, None]).sum(-1)
+    contour = strips.contour(station)
+    margin = 0.25 * evidence.width[:, :, None]
+    covered = (lateral < contour[:, :, 0] + margin) & (lateral > contour[:, :, 1] - margin)
+    parallel = torch.einsum("bki,bji->bkj", strips.along, strips.along).abs() > 0.95
+    overlap = (covered | covered.mT) & parallel
+    left = scores.clone()
+    chosen, values = [], []
+    for _ in range(count):
+        value, index = left.max(1)
+        chosen.append(index)
+        values.append(value)
+        hidden = overlap.gather(1, index[:, None, None].expand(-1, 1, overlap.shape[2]))[:, 0]
+        left = left.masked_fill(hidden, 0.0).scatter(1, index[:, None], 0.0)
+    return torch.stack(chosen, 1), torch.stack(values, 1)

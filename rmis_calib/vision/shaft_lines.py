@@ -1,0 +1,248 @@
+"""The shaft detector: pictures in, contour lines, axis and shaft end out, with uncertainty and a reason per frame."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from rmis_calib.errors import ShapeError
+from rmis_calib.geometry import Camera, axis_from_contours, plane_normal_from_points
+from rmis_calib.vision import edges, ends
+from rmis_calib.vision.lens import Lens
+from rmis_calib.vision.linefit import LineFit, fit_lines
+from rmis_calib.vision.reasons import FrameReason
+from rmis_calib.vision.runs import smooth_over
+from rmis_calib.vision.search import Stages, search
+from rmis_calib.vision.settings import DetectorSettings
+from rmis_calib.vision.strips import Strips
+from rmis_calib.vision.trace import Trace
+
+_POLYLINE = 24
+DEBUG=False
+
+
+@dataclass(frozen=True, eq=False)
+class ShaftDetections:
+    """Up to k shafts a frame, best first.
+
+    Convention: normalised undistorted coordinates (x/z, y/z); without a camera they are pixels. Edge 0 is on the left
+    of somebody who walks in the picture from the RCM side to the tip; points run in that direction. Where `valid` is
+    false everything else is NaN or false.
+    """
+
+    valid: Bool[Tensor, "b k"]
+    reason: Int[Tensor, " b"]
+    """`FrameReason` of each frame."""
+    contour_xy: Float[Tensor, "b k 2 2 2"]
+    """[edge, point, xy]: two points a contour, one rms spread of its samples before and behind their centre."""
+    contour_sigma: Float[Tensor, "b k 2"]
+    """Standard deviation of either point of a contour across it; the errors of the two points are uncorrelated."""
+    axis_xy: Float[Tensor, "b k 2 2"]
+    """Two points of the projected axis: the bisector of the contour planes (the midline without a camera)."""
+    axis_sigma: Float[Tensor, "b k"]
+    end_xy: Float[Tensor, "b k 2"]
+    """Projection of the point of the axis at which the shaft ends."""
+    end_sigma: Float[Tensor, "b k"]
+    """Standard deviation along the axis."""
+    end_valid: Bool[Tensor, "b k"]
+    direction_known: Bool[Tensor, "b k"]
+    """Whether it is certain which side the tip is on."""
+    confidence: Float[Tensor, "b k"]
+    contour_uv: Float[Tensor, "b k 2 p 2"]
+    """Contours as raw-pixel polylines from the border to the shaft's end, for pictures."""
+    end_uv: Float[Tensor, "b k 2"]
+    """The boundary as it was seen, raw pixels."""
+    scatter_px: Float[Tensor, "b k 2"]
+    """Robust standard deviation of one contour point about its line, px."""
+    blur_px: Float[Tensor, "b k 2"]
+    """Standard deviation of the blur of each contour, px."""
+
+
+class ShaftDetector:
+    """Finds instrument shafts in batches of pictures, on the device that the pictures are on."""
+
+    def __init__(self, settings: DetectorSettings | None = None, camera: Camera | None = None) -> None:
+        """Keep the limits and the camera.
+
+        Args:
+            settings: defaults serve every picture that the project was tested on.
+            camera: None leaves everything in pixels, with no undistortion.
+        """
+        self.settings = settings or DetectorSettings()
+        self.lens = Lens(camera)
+
+    def detect(self, images: Tensor) -> ShaftDetections:
+        """Shafts of each picture.
+
+        Args:
+            images: (b, 3, h, w) RGB, uint8, or floating point in [0, 1].
+
+        Raises:
+            ShapeError: another shape or dtype, a picture smaller than 64 px, or not of the camera's size.
+        """
+        return self.explain(images)[0]
+
+    def explain(self, images: Tensor) -> tuple[ShaftDetections, Stages]:
+        """Shafts, and what each stage of the coarse search saw. Arguments and errors as in `detect`."""
+        self._check(images)
+        with torch.no_grad():
+            pixels = images.to(torch.float32) / 255.0 if images.dtype == torch.uint8 else images.to(torch.float32)
+            broken = ~torch.isfinite(pixels).flatten(1).all(1)
+            pixels = torch.nan_to_num(pixels, nan=0.0, posinf=0.0, neginf=0.0)
+            trace, scores, stages = search(pixels, self.lens, self.settings, self.settings.max_shafts)
+            return self._measure(pixels, trace, scores, stages, broken), stages
+
+    def _check(self, images: Tensor) -> None:
+        where = "images"
+        if images.ndim != 4 or images.shape[1] != 3:
+            raise ShapeError(where=where, expected="(b, 3, h, w) RGB", found=tuple(images.shape))
+        if images.dtype != torch.uint8 and not images.dtype.is_floating_point:
+            raise ShapeError(where=where, expected="uint8 or floating point in [0, 1]", found=images.dtype)
+        size = (images.shape[2], images.shape[3])
+        if images.shape[0] == 0 or min(size) < 64:
+            raise ShapeError(where=where, expected="at least one picture of 64 x 64 px", found=tuple(images.shape))
+        camera = self.lens.camera
+        if camera is not None and tuple(camera.image_size) != size:
+            raise ShapeError(where=where, expected=f"(height, width) of the camera, {camera.image_size}", found=size)
+
+    def _measure(
+        self, pixels: Tensor, trace: Trace, scores: Float[Tensor, "b k"], stages: Stages, broken: Bool[Tensor, " b"]
+    ) -> ShaftDetections:
+        """Sub-pixel contours, axis and end of the traced strips."""
+        points, fit = self._contours(pixels, trace)
+        strips = replace(trace.strips, offset=fit.offset, slope=fit.slope)
+        end = ends.locate(pixels, self.lens, strips, trace.end, trace.width, self.settings.sigma_floor_px * 5)
+        share = (points.valid.to(fit.inliers.dtype).mean(-1) * fit.inliers / self.settings.edge_samples).amin(-1)
+        confidence = _confidence(trace, fit, share)
+        clear = (share > 0.15) & (scores > 0) & (fit.spread_t.amin(-1) > 0)
+        valid = clear & (confidence >= self.settings.min_confidence) & ~broken[:, None]
+        order = torch.where(valid, confidence, -1.0).sort(dim=1, descending=True, stable=True).indices
+        reason = _reason(stages, scores, clear, valid, broken)
+        found = self._assemble(trace, strips, points, fit, end, valid, confidence, reason)
+        return _reorder(found, order)
+
+    def _contours(self, pixels: Tensor, trace: Trace) -> tuple[edges.EdgePoints, LineFit]:
+        """Edge points found roughly, then finely, and the lines through them."""
+        settings, lens, strips = self.settings, self.lens, trace.strips
+        t = edges.place_samples(trace.on, trace.t, settings.edge_samples)
+        lateral = edges.interpolate(trace.lateral, trace.t, t)
+        step = torch.full_like(strips.offset, max(1.0, pixels.shape[-1] / settings.small_width_px / 3))
+        points = edges.rough(pixels, lens, strips, t, lateral, step)
+        both = t[:, :, None].expand_as(points.lateral)
+        main = edges.at_stations(trace.main, trace.t, t)[:, :, None].expand_as(both)
+        line = fit_lines(both, points.lateral, points.valid.to(t.dtype), main, settings.sigma_floor_px)
+        straight = line.offset[..., None] + line.slope[..., None] * both
+        near = points.valid & ((points.lateral - straight).abs() < 4 * line.scatter_px[..., None])
+        centre = straight + smooth_over(points.lateral - straight, near)
+        points = edges.fine(pixels, lens, strips, t, centre, (points.blur_px / 1.3).clamp(1.0, 4.0))
+        usual = points.height.median(-1, keepdim=True).values.clamp(min=1e-6)
+        weight = points.valid * (points.height / usual).clamp(0.3, 1.5)
+        return points, fit_lines(both, points.lateral, weight, main, settings.sigma_floor_px)
+
+    def _assemble(
+        self,
+        trace: Trace,
+        strips: Strips,
+        points: edges.EdgePoints,
+        fit: LineFit,
+        end: ends.ShaftEnd,
+        valid: Bool[Tensor, "b k"],
+        confidence: Float[Tensor, "b k"],
+        reason: Int[Tensor, " b"],
+    ) -> ShaftDetections:
+        focal = self.lens.focal_px
+        along = torch.stack([fit.centre_t - fit.spread_t, fit.centre_t + fit.spread_t], -1)  # (b, k, 2, 2)
+        lateral = fit.offset[..., None] + fit.slope[..., None] * along
+        contour = self._normalised(strips.points(along, lateral))
+        middle = strips.contour(end.t[..., None]).mean(2)
+        end_ideal = strips.points(end.t[..., None], middle)[:, :, 0]
+        axis, end_xy = _axis(contour, self._normalised(end_ideal), self.lens.camera is not None)
+        stop = torch.where(end.valid, end.t, trace.end)
+        share = torch.linspace(0, 1, _POLYLINE, device=stop.device)
+        t = trace.start[..., None] + (stop - trace.start)[..., None] * share
+        polyline = strips.points(t[:, :, None].expand(-1, -1, 2, -1), strips.contour(t))
+        sigma = fit.sigma_px / focal
+        known = trace.start_at_border & ~trace.end_at_border
+        nan = lambda value: torch.where(valid.reshape(*valid.shape, *[1] * (value.ndim - 2)), value, torch.nan)  # noqa: E731
+        end_valid = end.valid & valid & ~trace.end_at_border
+        has_end = lambda value: torch.where(end_valid.reshape(*valid.shape, *[1] * (value.ndim - 2)), value, torch.nan)  # noqa: E731
+        return ShaftDetections(
+            valid=valid,
+            reason=reason,
+            contour_xy=nan(contour),
+            contour_sigma=nan(sigma),
+            axis_xy=nan(axis),
+            axis_sigma=nan(0.5 * sigma.square().sum(-1).sqrt()),
+            end_xy=has_end(end_xy),
+            end_sigma=has_end(end.sigma_px / focal),
+            end_valid=end_valid,
+            direction_known=known & valid,
+            confidence=nan(confidence),
+            contour_uv=nan(self.lens.to_raw(polyline)),
+            end_uv=has_end(self.lens.to_raw(end_ideal)),
+            scatter_px=nan(fit.scatter_px),
+            blur_px=nan(points.blur_px),
+        )
+
+    def _normalised(self, ideal: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
+        return self.lens.normalise(ideal)
+
+
+def _axis(
+    contour: Float[Tensor, "b k 2 2 2"], end: Float[Tensor, "b k 2"], calibrated: bool
+) -> tuple[Float[Tensor, "b k 2 2"], Float[Tensor, "b k 2"]]:
+    """Two points of the axis line, and the end moved from the rim that is seen to the axis behind it.
+
+    In the plane of the axis the rim is nearer than the axis by the factor 1 - sin(half angle), at the same place along
+    the axis.
+    """
+    middle = contour.mean(2)  # mean of the edges at either point
+    if not calibrated:
+        return middle, end
+    normals = plane_normal_from_points(contour[..., 0, :], contour[..., 1, :])
+    plane = axis_from_contours(normals, 1.0)
+    n = plane.camera_n_axis
+    size = n[..., :2].square().sum(-1).clamp(min=1e-12)
+    off = ((middle * n[..., None, :2]).sum(-1) + n[..., None, 2]) / size[..., None]
+    axis = middle - off[..., None] * n[..., None, :2]
+    along = torch.linalg.cross(n, plane.camera_u)
+    ray = torch.cat([end, torch.ones_like(end[..., :1])], -1)
+    depth, shift = (ray * plane.camera_u).sum(-1), (ray * along).sum(-1)
+    on_axis = plane.camera_u * depth[..., None] + along * (shift * (1 - plane.half_angle_rad.sin()))[..., None]
+    return axis, on_axis[..., :2] / on_axis[..., 2:]
+
+
+def _confidence(trace: Trace, fit: LineFit, share: Float[Tensor, "b k"]) -> Float[Tensor, "b k"]:
+    """Product of saturating marks for contrast, length, agreement of the edge points, and reaching the border."""
+    contrast = trace.contrast / (trace.contrast + 0.08)
+    length = 1 - torch.exp(-1.2 * trace.length / trace.width.clamp(min=1.0))
+    agreement = 1 / (1 + (fit.scatter_px.amax(-1) / (0.5 + 0.06 * trace.width)).square())
+    border = torch.where(trace.start_at_border, 1.0, 0.45)
+    if DEBUG: print(contrast,length,agreement,border,share,trace.length,trace.width,fit.inliers,fit.scatter_px)
+    return contrast * length * agreement * border * (share / 0.6).clamp(max=1.0)
+
+
+def _reason(stages: Stages, scores: Tensor, clear: Tensor, valid: Tensor, broken: Tensor) -> Int[Tensor, " b"]:
+    """The furthest stage that each frame reached."""
+    flat = torch.where(stages.seen, stages.unlike, torch.nan).flatten(1)
+    spread = torch.nan_to_num(flat.nanquantile(0.99, 1) - flat.nanquantile(0.01, 1))
+    evidence = stages.evidence
+    reason = torch.full_like(scores[:, 0], FrameReason.AMBIGUOUS, dtype=torch.int64)
+    for failed, why in (
+        (~clear.any(1), FrameReason.EDGES_UNCLEAR),
+        (~(scores > 0).any(1), FrameReason.TOO_SHORT),
+        (~(evidence.on.any(-1) & evidence.strips.valid).any(1), FrameReason.NOT_A_CYLINDER),
+        (~evidence.strips.valid.any(1), FrameReason.NO_STRAIGHT_EDGES),
+        ((spread < 0.1) | ~stages.seen.flatten(1).any(1), FrameReason.NO_PICTURE),
+        (broken, FrameReason.BAD_PIXELS),
+    ):
+        reason = torch.where(failed, int(why), reason)
+    return torch.where(valid.any(1), int(FrameReason.OK), reason)
+
+
+def _reorder(found: ShaftDetections, order: Tensor) -> ShaftDetections:
+    """The same detections with the candidates of each frame in another order."""
+    rows = torch.arange(order.shape[0], device=order.device)[:, None]
+    fields = {name: value[rows, order] for name, value in vars(found).items() if name != "reason"}
+    return replace(found, **fields)

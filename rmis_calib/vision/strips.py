@@ -1,0 +1,150 @@
+"""Strips between two nearly parallel lines: the candidates for a shaft, and what the small picture says for them.
+
+A strip has its own frame: station t along it, lateral y to the *left* of somebody who walks along it (the picture's x
+points right and y down). Contours are y = offset + slope * t. All lengths are full-resolution ideal pixels.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from rmis_calib.vision.hough import HoughLines
+from rmis_calib.vision.lens import Lens
+from rmis_calib.vision.sampling import inside, sample
+from rmis_calib.vision.settings import DetectorSettings
+
+
+@dataclass(frozen=True, eq=False)
+class SmallPicture:
+    """The small picture and how to read it at full-resolution ideal pixels."""
+
+    layers: Float[Tensor, "b 2 h w"]
+    """Unlikeness to a shaft; 1 inside the field of view, else 0."""
+    factor: int
+    """Full-resolution pixels a small one."""
+    image_size: tuple[int, int]
+    """(height, width) at full resolution."""
+    lens: Lens
+    half_diagonal_px: float
+    """Reach of a line from the centre of the picture, ideal px."""
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """Middle of the picture, px."""
+        return (self.image_size[1] - 1) / 2, (self.image_size[0] - 1) / 2
+
+    def read(self, ideal: Float[Tensor, "b *points 2"]) -> tuple[Float[Tensor, "b *points"], Bool[Tensor, "b *points"]]:
+        """Unlikeness at ideal points, and whether they lie in the field of view."""
+        raw = self.lens.to_raw(ideal)
+        values = sample(self.layers, (raw + 0.5) / self.factor - 0.5)
+        return values[..., 0], (values[..., 1] > 0.75) & inside(raw, self.image_size)
+
+
+@dataclass(frozen=True, eq=False)
+class Strips:
+    """k candidate strips a frame."""
+
+    origin: Float[Tensor, "b k 2"]
+    """Point of the middle line nearest to the centre of the picture."""
+    along: Float[Tensor, "b k 2"]
+    """Unit direction of growing t."""
+    offset: Float[Tensor, "b k 2"]
+    """Lateral place of [left, right] contour at t = 0."""
+    slope: Float[Tensor, "b k 2"]
+    """Slope of [left, right] contour."""
+    valid: Bool[Tensor, "b k"]
+
+    @property
+    def left(self) -> Float[Tensor, "b k 2"]:
+        """Unit lateral direction."""
+        return torch.stack([self.along[..., 1], -self.along[..., 0]], -1)
+
+    def contour(self, t: Float[Tensor, "b k s"]) -> Float[Tensor, "b k 2 s"]:
+        """Lateral place of [left, right] contour at stations."""
+        return self.offset[..., None] + self.slope[..., None] * t[..., None, :]
+
+    def points(self, t: Float[Tensor, "b k *s"], y: Float[Tensor, "b k *s"]) -> Float[Tensor, "b k *s 2"]:
+        """Ideal pixels of (station, lateral) pairs."""
+        shape = (*t.shape[:2], *[1] * (t.ndim - 2), 2)
+        return self.origin.reshape(shape) + t[..., None] * self.along.reshape(shape) + y[..., None] * self.left.reshape(shape)
+
+    def pick(self, index: Tensor) -> "Strips":
+        """The strips with these indices, (b, k') int64."""
+        wide = index[..., None].expand(*index.shape, 2)
+        vectors = (value.gather(1, wide) for value in (self.origin, self.along, self.offset, self.slope))
+        return Strips(*vectors, self.valid.gather(1, index))
+
+    def reverse(self, where: Bool[Tensor, "b k"]) -> "Strips":
+        """The same strips walked the other way round where asked: left and right change places."""
+        flip = where[..., None]
+        return replace(
+            self,
+            along=torch.where(flip, -self.along, self.along),
+            offset=torch.where(flip, -self.offset.flip(-1), self.offset),
+            slope=torch.where(flip, self.slope.flip(-1), self.slope),
+        )
+
+
+def snap(picture: SmallPicture, lines: HoughLines) -> HoughLines:
+    """Lines moved onto the ridge of the gradient that they follow, by weighted least squares in a shrinking gate.
+
+    Args:
+        lines: `rho` in full-resolution px.
+    """
+    stations, step = 96, float(picture.factor)
+    t = torch.linspace(-1, 1, stations, device=lines.rho.device) * picture.half_diagonal_px
+    deltas = torch.arange(-4, 5, device=t.device, dtype=t.dtype) * step
+    centre = t.new_tensor(picture.centre)
+    tangent = torch.stack([-lines.normal[..., 1], lines.normal[..., 0]], -1)
+    across = lines.rho[..., None, None] + deltas  # (b, p, 1, 9)
+    points = centre + across[..., None] * lines.normal[:, :, None, None] + (t[:, None, None] * tangent[:, :, None, None])
+    value, seen = picture.read(points)
+    rise = ((value[..., 2:] - value[..., :-2]) * (seen[..., 2:] & seen[..., :-2])).clamp(0.0, 0.5)
+    place = deltas[1:-1].expand_as(rise)
+    offset, slope = torch.zeros_like(lines.rho), torch.zeros_like(lines.rho)
+    for gate in (2.0 * step, 1.4 * step, 1.0 * step):
+        miss = place - offset[..., None, None] - slope[..., None, None] * t[:, None]
+        weight = rise * torch.exp(-0.5 * (miss / gate) ** 2)
+        offset, slope = _weighted_line(t, place, weight)
+    normal = lines.normal - slope[..., None] * tangent
+    length = normal.norm(dim=-1, keepdim=True)
+    return HoughLines(normal / length, (lines.rho + offset) / length[..., 0], lines.votes)
+
+
+def _weighted_line(t: Tensor, place: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Offset at t = 0 and slope of the weighted line through (t, place); slope within 3 degrees."""
+    total = weight.sum((-1, -2)).clamp(min=1e-6)
+    mean_t = (weight * t[:, None]).sum((-1, -2)) / total
+    mean_y = (weight * place).sum((-1, -2)) / total
+    dt = t[:, None] - mean_t[..., None, None]
+    slope = (weight * dt * place).sum((-1, -2)) / (weight * dt * dt).sum((-1, -2)).clamp(min=1e-6)
+    slope = slope.clamp(-0.05, 0.05)
+    return mean_y - slope * mean_t, slope
+
+
+def pair(lines: HoughLines, picture: SmallPicture, settings: DetectorSettings, count: int) -> Strips:
+    """The `count` most voted pairs of lines that could be the contours of one cylinder.
+
+    They face away from each other, converge little, and enclose a plausible width near the middle of the picture.
+    """
+    first, second = torch.triu_indices(lines.rho.shape[1], lines.rho.shape[1], 1, device=lines.rho.device)
+    n_a, n_b = lines.normal[:, first], lines.normal[:, second]
+    rho_a, rho_b = lines.rho[:, first], lines.rho[:, second]
+    left = n_a - n_b
+    left = left / left.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+    along = torch.stack([-left[..., 1], left[..., 0]], -1)
+    cos_a, cos_b = (n_a * left).sum(-1), -(n_b * left).sum(-1)
+    slope = torch.stack([-(n_a * along).sum(-1) / cos_a, (n_b * along).sum(-1) / cos_b], -1)
+    offset = torch.stack([rho_a / cos_a, -rho_b / cos_b], -1)
+    width = (offset[..., 0] - offset[..., 1]) * 1.0
+    facing = (n_a * n_b).sum(-1) < -torch.cos(torch.deg2rad(width.new_tensor(settings.max_convergence_deg)))
+    size = float(picture.image_size[1])
+    fits = (width > settings.min_width_fraction * size) & (width < settings.max_width_fraction * size)
+    score = torch.minimum(lines.votes[:, first], lines.votes[:, second]) * (facing & fits)
+    best = score.topk(min(count, score.shape[1]), dim=1)
+    centre = width.new_tensor(picture.centre)
+    middle = offset.mean(-1, keepdim=True)
+    strips = Strips(centre + middle * left, along, offset - middle, slope, score > 0)
+    return strips.pick(best.indices)

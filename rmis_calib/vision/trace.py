@@ -1,0 +1,195 @@
+"""Follow both contours of the best strips station by station on the small picture, and find the stretch that is a shaft.
+
+The search for strips assumes straight lines; here each contour may wander by a fifth of the shaft's width, so that a
+lens whose distortion nobody measured, or a bent shaft, does not lose the far end.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from rmis_calib.vision.linefit import fit_lines
+from rmis_calib.vision.runs import first_on, last_on, longest_run, masked_median, masked_quantile, run_lengths, run_minimum, smooth_over
+from rmis_calib.vision.settings import DetectorSettings
+from rmis_calib.vision.strips import SmallPicture, Strips
+
+_STATIONS = 160
+_OFFSETS = 9
+# Where between shaft (0) and surroundings (1) the inside may lie. Wrists of bare metal lie at 0.5 to 0.7, shaded shafts
+# below 0.35, a stretch of shaft lit differently beyond an interruption at up to 0.6 (frames of both real sets).
+_TONE_SHARE = 0.38
+_RUN_SHARE = 0.75
+_CONTRAST_SHARE = 0.67
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """Strips turned to run towards the tip, and where their contours were seen."""
+
+    strips: Strips
+    t: Float[Tensor, " s"]
+    """Stations, px, rising towards the tip."""
+    main: Bool[Tensor, "b k s"]
+    """The longest unbroken stretch of `on`."""
+    on: Bool[Tensor, "b k s"]
+    """At least one contour is seen, no seen one is missing, and the inside has the shaft's own tone."""
+    lateral: Float[Tensor, "b k 2 s"]
+    """Lateral place of [left, right] contour, px, smooth along the shaft."""
+    start: Float[Tensor, "b k"]
+    """First station of the shaft, px."""
+    end: Float[Tensor, "b k"]
+    """Last station of the last stretch long enough to carry the shaft's end, px."""
+    start_at_border: Bool[Tensor, "b k"]
+    end_at_border: Bool[Tensor, "b k"]
+    """Whether the shaft leaves the field of view at its start and at its end."""
+    width: Float[Tensor, "b k"]
+    """Median width, px."""
+    length: Float[Tensor, "b k"]
+    """Supported length, px."""
+    contrast: Float[Tensor, "b k"]
+    """Median over the shaft of the weaker contour's step, log brightness and tint."""
+    surround: Float[Tensor, "b k"]
+    """How far the surroundings lie above the shaft's own tone."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Sides:
+    lateral: Float[Tensor, "b k 2 s"]
+    rise: Float[Tensor, "b k 2 s"]
+    outer: Float[Tensor, "b k 2 s"]
+    seen: Bool[Tensor, "b k 2 s"]
+
+
+def _follow(picture: SmallPicture, strips: Strips, stations: Float[Tensor, "b k s"]) -> _Sides:
+    """The strongest outward rise near each predicted contour."""
+    predicted = strips.contour(stations)  # (b, k, 2, s)
+    width = (predicted[:, :, :1] - predicted[:, :, 1:]).clamp(min=1.0)
+    unit = float(picture.factor)
+    near = (0.07 * width).clamp(min=1.5 * unit)[..., None]
+    reach = (0.2 * width).clamp(min=2.0 * unit)[..., None]
+    share = torch.linspace(-1, 1, _OFFSETS, device=stations.device)
+    lateral = predicted[..., None] + reach * share  # (b, k, 2, s, o)
+    outward = stations.new_tensor([1.0, -1.0])[:, None, None]
+    both = torch.stack([lateral + near * outward, lateral - near * outward], -1)
+    at = stations[:, :, None, :, None, None].expand_as(both)
+    value, seen = picture.read(strips.points(at, both))
+    rise = torch.where(seen.all(-1), value[..., 0] - value[..., 1], 0.0)
+    best = (rise * torch.exp(-0.5 * (1.2 * share) ** 2)).argmax(-1, keepdim=True)
+    pick = [v.gather(-1, best)[..., 0] for v in (lateral, rise, value[..., 0])]
+    return _Sides(*pick, seen[..., _OFFSETS // 2, :].all(-1))
+
+
+def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> Trace:
+    """Contours, the stretch that is a shaft, and which way the tip is."""
+    t = torch.linspace(-1, 1, _STATIONS, device=strips.offset.device) * picture.half_diagonal_px
+    spacing = float(t[1] - t[0])
+    stations = t.expand(*strips.valid.shape, _STATIONS)
+    sides = _follow(picture, strips, stations)
+    left, right = sides.lateral.unbind(2)
+    across = t.new_tensor([-0.35, -0.233, -0.117, 0.0, 0.117, 0.233, 0.35, -0.85, 0.85])
+    inner_y = 0.5 * (left + right)[..., None] + (left - right)[..., None] * across
+    value, inner_seen = picture.read(strips.points(stations[..., None].expand_as(inner_y), inner_y))
+    # The third darkest of seven: a glare stripe may cover half of the width and more.
+    inner, centre_seen = value[..., :7].kthvalue(3, -1).values, inner_seen[..., 3]
+
+    inf = t.new_tensor(torch.inf)
+    step = torch.where(sides.seen, sides.rise, inf).amin(2)
+    outer = torch.where(sides.seen, sides.outer, inf).amin(2)
+    wide = left - right > settings.min_width_fraction * picture.image_size[1]
+    on = centre_seen & sides.seen.any(2) & wide & strips.valid[..., None]
+    on &= (step > settings.min_contrast) & (inner < outer - 0.5 * settings.min_contrast)
+    surround = masked_median(torch.where(on, outer, 0.0) - inner, on)
+    on &= _own_tone(inner, outer, on, on)
+
+    line = strips.contour(stations)
+    wander = smooth_over(sides.lateral - line, (on[:, :, None] & sides.seen))
+    width = masked_median(left - right, on & sides.seen.all(2))
+    on &= run_lengths(on) * spacing > (0.4 * width).clamp(min=2.5 * spacing)[..., None]
+    # The end may lie on a stretch whose contours do not continue these lines (a sleeve, a lens that bends them): there it
+    # is enough that the inside has the shaft's tone and both sides, most of a width away, do not.
+    far = torch.where(inner_seen[..., 7:], value[..., 7:], inf).amin(-1)
+    band = centre_seen & torch.isfinite(far) & (inner < far - settings.min_contrast) & strips.valid[..., None]
+    band = on | (band & _own_tone(inner, far, band, on))
+    long_runs = band & (run_lengths(band) * spacing > settings.end_run_widths * width[..., None] - spacing)
+    carries_end = torch.where(long_runs.any(-1, keepdim=True), long_runs, on)
+    contrast = masked_median(torch.where(torch.isfinite(step), step, 0.0), on)
+    length = on.float().sum(-1) * spacing
+    whole = Trace(
+        strips, t, longest_run(on), on, line + wander, first_on(t, on), last_on(t, carries_end), *_borders(t, on, centre_seen, width),
+        width, length, contrast, surround,
+    )  # fmt: skip
+    return _towards_tip(whole, first_on(t, carries_end), last_on(t, on), t, centre_seen)
+
+
+def straighten(traced: Trace) -> Strips:
+    """The strips with straight lines through their traced contours."""
+    t = traced.t.expand_as(traced.lateral)
+    weight = traced.on[:, :, None].expand_as(traced.lateral).to(t.dtype)
+    main = traced.main[:, :, None].expand_as(traced.lateral)
+    line = fit_lines(t, traced.lateral, weight, main, 0.1 * float(traced.t[1] - traced.t[0]))
+    sane = (line.inliers > 5) & (line.slope.abs() < 0.2)
+    both = sane.all(-1, keepdim=True)
+    strips = traced.strips
+    return replace(
+        strips,
+        offset=torch.where(both, line.offset, strips.offset),
+        slope=torch.where(both, line.slope, strips.slope),
+    )
+
+
+def _own_tone(
+    inner: Float[Tensor, "b k s"],
+    outer: Float[Tensor, "b k s"],
+    on: Bool[Tensor, "b k s"],
+    known: Bool[Tensor, "b k s"],
+) -> Bool[Tensor, "b k s"]:
+    """Stations whose inside is still the shaft and not the metal of the wrist, which has contours too.
+
+    Where light falls off along the shaft, its contrast to the surroundings stays; where the background changes, its tone
+    stays; a wrist keeps neither. Another stretch of shaft beyond an interruption may be lit differently, so each
+    unbroken run is compared with its own darkest part, and only that with what is `known` of the shaft.
+    """
+    contrast = torch.where(on, outer - inner, 0.0)
+    usual = masked_quantile(contrast, known, 0.75)[..., None]
+    darkest = run_minimum(inner, on)
+    tone = masked_quantile(inner, known, 0.25)[..., None]
+    same_shaft = darkest < tone + _RUN_SHARE * (outer - tone)
+    steady = (inner < darkest + _TONE_SHARE * (outer - darkest)) | (contrast > _CONTRAST_SHARE * usual)
+    return same_shaft & steady
+
+
+def _borders(
+    t: Float[Tensor, " s"], on: Bool[Tensor, "b k s"], seen: Bool[Tensor, "b k s"], width: Float[Tensor, "b k"]
+) -> tuple[Bool[Tensor, "b k"], Bool[Tensor, "b k"]]:
+    """Whether the shaft reaches the end of the field of view on its low and on its high side."""
+    reach = 0.5 * width + 3 * (t[1] - t[0])
+    return first_on(t, on) - first_on(t, seen) < reach, last_on(t, seen) - last_on(t, on) < reach
+
+
+def _towards_tip(
+    low_to_high: Trace, low_end: Float[Tensor, "b k"], high_start: Float[Tensor, "b k"], t: Tensor, seen: Tensor
+) -> Trace:
+    """The trace walked from the border inwards: turned round where the shaft enters on the high side."""
+    low, high = low_to_high.start_at_border, low_to_high.end_at_border
+    low_gap = low_to_high.start - first_on(t, seen)
+    high_gap = last_on(t, seen) - high_start
+    flip = (high & ~low) | ((high == low) & (high_gap < low_gap))
+    turn = flip[..., None]
+    lateral = torch.where(turn[..., None], -low_to_high.lateral.flip(2).flip(3), low_to_high.lateral)
+    return Trace(
+        strips=low_to_high.strips.reverse(flip),
+        t=t,
+        main=torch.where(turn, low_to_high.main.flip(-1), low_to_high.main),
+        on=torch.where(turn, low_to_high.on.flip(-1), low_to_high.on),
+        lateral=lateral,
+        start=torch.where(flip, -high_start, low_to_high.start),
+        end=torch.where(flip, -low_end, low_to_high.end),
+        start_at_border=torch.where(flip, high, low),
+        end_at_border=torch.where(flip, low, high),
+        width=low_to_high.width,
+        length=low_to_high.length,
+        contrast=low_to_high.contrast,
+        surround=low_to_high.surround,
+    )
