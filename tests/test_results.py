@@ -40,7 +40,7 @@ def test_round_trip(result, tmp_path):
 
 
 def test_left_transform_is_the_product_in_frame_order(result):
-    # camera_left_T_arm = camera_left_T_camera_right @ camera_right_T_arm: 5 + 10 along x; the other order has no meaning.
+    # camera_left_T_arm = camera_left_T_camera_right @ camera_right_T_arm: 5 + 10 along x.
     assert result.camera_left_T_arm.name == "camera_left_T_arm"
     assert result.camera_left_T_arm.t.tolist() == [15.0, 0.0, 0.0]
 

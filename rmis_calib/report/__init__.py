@@ -8,6 +8,8 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "DETECTED_RGB": ".overlays",
         "PREDICTED_RGB": ".overlays",
         "Overlay": ".overlays",
+        "write_calibration_folder": ".folder",
+        "write_detection_folder": ".folder",
         "write_report": ".page",
     },
 )

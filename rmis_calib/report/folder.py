@@ -1,0 +1,115 @@
+"""What `calibrate` and `detect` leave behind: tables, pictures and the report, in a folder."""
+
+import csv
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from rmis_calib.errors import OutputError
+from rmis_calib.io.atomic import write_yaml
+from rmis_calib.pipeline.calibration import CalibrationRun
+from rmis_calib.pipeline.detection import DetectionTable, View
+from rmis_calib.report.page import write_report
+from rmis_calib.report.pictures import overlays, spread
+from rmis_calib.results import finite_or_none
+from rmis_calib.vision import FrameReason, draw_detections
+
+REPORT_PICTURES = 12
+"""Pictures embedded in the page: enough to see every kind of view, few enough for a page of some 2 MB."""
+
+LINE_COLUMNS = (
+    "camera", "frame", "candidate", "found", "reason", "confidence", "direction_known",
+    *(f"contour{edge}_{point}_{axis}" for edge in (0, 1) for point in ("rcm", "tip") for axis in "xy"),
+    "sigma_contour0", "sigma_contour1", "end_x", "end_y", "sigma_end", "end_u_px", "end_v_px",
+)  # fmt: skip
+
+
+def write_calibration_folder(folder: Path, run: CalibrationRun, count: int) -> None:
+    """result.json, config.yaml, observations.npz, overlays/*.jpg and report.html.
+
+    Args:
+        folder: existing folder.
+        run: what to write.
+        count: pictures per camera in `overlays`; -1 for every motion.
+    """
+    run.result.write(folder / "result.json")
+    write_yaml(folder / "config.yaml", finite_or_none(run.result.config))
+    if run.observations is not None:
+        run.observations.save(folder / "observations.npz")
+    pictures = folder / "overlays"
+    pictures.mkdir()
+    for overlay in overlays(run, count):
+        _write_picture(pictures / f"{overlay.camera}_{overlay.frame:06d}.jpg", overlay.image)
+    per_view = max(1, REPORT_PICTURES // len(run.views))
+    name = run.recording.path.resolve().name
+    write_report(
+        folder / "report.html",
+        run.result,
+        tuple(overlays(run, per_view)),
+        title=f"Hand-eye calibration: {name}",
+        source=name,
+    )
+
+
+def write_detection_folder(folder: Path, table: DetectionTable, count: int) -> None:
+    """lines.csv, lines.npz and overlays/*.jpg.
+
+    Args:
+        folder: existing folder.
+        table: what was detected.
+        count: pictures per camera; -1 for every frame.
+    """
+    with (folder / "lines.csv").open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(LINE_COLUMNS)
+        for view in table.views:
+            writer.writerows(_line_rows(view))
+    arrays = {
+        f"{name}_{view.side}": value.cpu().numpy()
+        for view in table.views
+        for name, value in vars(view.detections).items()
+    }
+    np.savez_compressed(folder / "lines.npz", allow_pickle=False, **arrays)
+    pictures = folder / "overlays"
+    pictures.mkdir()
+    for view in table.views:
+        for frame in spread(view.source.count, count):
+            image = view.source.frame(int(frame)).permute(1, 2, 0).cpu().numpy()
+            reason = FrameReason(int(view.detections.reason[frame]))
+            label = f"frame {frame}" + ("" if reason is FrameReason.OK else f": {reason.sentence}")
+            _write_picture(
+                pictures / f"{view.side}_{frame:06d}.jpg",
+                draw_detections(image, view.detections, int(frame), label=label),
+            )
+
+
+def _line_rows(view: View) -> list[list[object]]:
+    """One row a candidate, and one for a frame without any."""
+    found = view.detections
+    numbers = torch.cat(
+        [found.contour_xy.flatten(2), found.contour_sigma, found.end_xy, found.end_sigma[..., None], found.end_uv],
+        dim=-1,
+    ).double()
+    rows: list[list[object]] = []
+    for frame, is_valid in enumerate(found.valid.tolist()):
+        reason = FrameReason(int(found.reason[frame])).sentence
+        if not any(is_valid):
+            rows.append([view.side, frame, "", 0, reason, *[""] * (len(LINE_COLUMNS) - 5)])
+        for candidate in np.flatnonzero(is_valid):
+            values = ["" if np.isnan(x) else f"{x:.9g}" for x in numbers[frame, candidate].tolist()]
+            confidence = f"{float(found.confidence[frame, candidate]):.3f}"
+            direction = int(found.direction_known[frame, candidate])
+            rows.append([view.side, frame, int(candidate), 1, "", confidence, direction, *values])
+    return rows
+
+
+def _write_picture(path: Path, image_rgb: np.ndarray) -> None:
+    """A JPEG from RGB.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    if not cv2.imwrite(str(path), np.ascontiguousarray(image_rgb[..., ::-1])):
+        raise OutputError(where=str(path), expected="a place that can be written")

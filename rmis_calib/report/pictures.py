@@ -1,0 +1,82 @@
+"""Frames with the detected and the predicted shaft drawn in, as the report's legend names them."""
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rmis_calib.geometry.cameras import Camera
+from rmis_calib.pipeline.calibration import CalibrationRun
+from rmis_calib.pipeline.detection import View
+from rmis_calib.report.overlays import DETECTED_RGB, PREDICTED_RGB, Overlay
+
+_SUBPIXEL_BITS = 4
+_SAMPLES = 200
+
+
+def overlays(run: CalibrationRun, count: int) -> Iterator[Overlay]:
+    """Pictures spread over the motions of each view, rejected ones among them; -1 for all."""
+    for view in run.views:
+        for motion in spread(len(run.poses.frames), count):
+            yield _overlay(run, view, int(motion))
+
+
+def spread(total: int, count: int) -> np.ndarray:
+    """Indices of `count` of `total` things, evenly spread from the first to the last; all for -1."""
+    if count < 0 or count >= total:
+        return np.arange(total)
+    return np.unique(np.linspace(0, total - 1, count).round().astype(int)) if count else np.arange(0)
+
+
+def _overlay(run: CalibrationRun, view: View, motion: int) -> Overlay:
+    frame = int(run.poses.frames[motion])
+    canvas = np.ascontiguousarray(view.source.frame(frame).permute(1, 2, 0).cpu().numpy())
+    thickness = max(1, round(canvas.shape[1] / 360))
+    choice = run.choices[run.views.index(view)]
+    candidate = int(choice.candidate[motion])
+    predicted, ends = run.predicted_contours(view), run.predicted_ends(view)
+    detections = view.detections
+    if candidate >= 0:
+        for polyline in detections.contour_uv[frame, candidate].cpu().numpy():
+            _draw(canvas, polyline, DETECTED_RGB, thickness)
+        if bool(detections.end_valid[frame, candidate]):
+            _dot(canvas, detections.end_uv[frame, candidate].cpu().numpy(), DETECTED_RGB, 2 * thickness)
+    if predicted is not None and view.camera is not None:
+        for polyline in contour_polylines(predicted[motion], view.camera):
+            _draw(canvas, polyline, PREDICTED_RGB, max(1, thickness - 1))
+    if ends is not None and view.camera is not None:
+        uv, visible = view.camera.project(ends[motion].cpu())
+        if bool(visible):
+            _dot(canvas, uv.numpy(), PREDICTED_RGB, thickness)
+    used = bool(run.result.motions.used[frame])
+    reason = run.result.motions.reasons[frame]
+    caption = f"frame {frame}: {'used' if used else 'not used'}" + (f" ({reason})" if reason else "")
+    return Overlay(frame=frame, camera=view.side, image=canvas, caption=caption, used=used)
+
+
+def contour_polylines(contour_n: Float[Tensor, "2 3"], camera: Camera) -> Float[np.ndarray, "2 p 2"]:
+    """Both contour planes as raw-pixel polylines across the picture; NaN where the lens model does not reach."""
+    line = contour_n.cpu() / contour_n[:, :2].cpu().norm(dim=-1, keepdim=True)
+    foot = -line[:, 2:] * line[:, :2]
+    along = torch.stack([-line[:, 1], line[:, 0]], dim=-1)
+    reach = 2.0 * max(camera.image_size) / float(camera.focal)
+    steps = torch.linspace(-reach, reach, _SAMPLES, dtype=line.dtype)
+    xy = foot[:, None] + along[:, None] * steps[:, None]
+    uv, valid = camera.project(torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1))
+    return torch.where(valid[..., None], uv, torch.nan).numpy()
+
+
+def _draw(canvas: np.ndarray, polyline: np.ndarray, colour: tuple[int, int, int], thickness: int) -> None:
+    known = np.isfinite(polyline).all(axis=-1) & (np.abs(polyline) < 8 * max(canvas.shape)).all(axis=-1)
+    points = (polyline[known] * (1 << _SUBPIXEL_BITS)).round().astype(np.int32)
+    if len(points) > 1:
+        cv2.polylines(canvas, [points], False, colour, thickness, cv2.LINE_AA, _SUBPIXEL_BITS)
+
+
+def _dot(canvas: np.ndarray, uv: np.ndarray, colour: tuple[int, int, int], radius: int) -> None:
+    if np.isfinite(uv).all() and (np.abs(uv) < 8 * max(canvas.shape)).all():
+        centre = tuple((uv * (1 << _SUBPIXEL_BITS)).round().astype(int).tolist())
+        cv2.circle(canvas, centre, radius << _SUBPIXEL_BITS, colour, -1, cv2.LINE_AA, _SUBPIXEL_BITS)
