@@ -57,7 +57,7 @@ is expressed at the RCM. `rigid_exp` puts the translation in directly; the expon
 coordinates are xy = (x/z, y/z), undistorted unless said otherwise. Distortion is Brown-Conrady, in the order k1, k2,
 p1, p2, k3. To the right in the scene is to the right in the picture, and down is down:
 
->>> camera = g.Camera.from_values(100, 100, 50, 40, image_size=(81, 101))
+>>> camera = g.Camera.from_values(100.0, 100.0, 50.0, 40.0, image_size=(81, 101))
 >>> uv, valid = camera.project(vector(1, 2, 10))
 >>> show(uv), bool(valid)
 ([60.0, 60.0], True)

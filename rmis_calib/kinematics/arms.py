@@ -121,7 +121,8 @@ class RobotKinematics:
         """
         if self._laparoscope is not None:
             self._laparoscope.check(joints)
-            return self._laparoscope.base_T_frames(joints)[..., -1, :, :] @ self._laparoscope.end_T_tool
+            base_T_end = self._laparoscope.frames_in_base(joints)[..., -1, :, :]
+            return base_T_end @ self._laparoscope.end_T_tool  # frames: tool = arm
         if joints.shape[-1] != 0:
             raise ShapeError(where="laparoscope readings", expected="(..., 0): no arm", found=tuple(joints.shape))
         return torch.eye(4, dtype=self._dtype, device=self._device).expand(*joints.shape[:-1], 4, 4)
@@ -138,7 +139,7 @@ class RobotKinematics:
         # With the wrist straight the head point is a place on the shaft, whatever the wrist does now.
         before_wrist = torch.arange(joints.shape[-1], device=joints.device) < self._shaft_frame
         straight = torch.where(before_wrist, joints, 0.0)
-        both = self._instrument.base_T_frames(torch.stack([joints, straight]))
+        both = self._instrument.frames_in_base(torch.stack([joints, straight]))
         base_T_rcm = both[0, ..., self._rcm_frame, :, :]
         rcm_T_base = rigid_inverse(base_T_rcm)
         rcm_T_shaft = rcm_T_base @ both[0, ..., self._shaft_frame, :, :]
@@ -151,7 +152,7 @@ class RobotKinematics:
         # Two poses far apart: a wrong frame can agree at one of them.
         count = len(self.instrument_joints)
         readings = torch.stack([torch.zeros(count), torch.full((count,), 0.5)]).to(self._device, self._dtype)
-        frames = self._instrument.base_T_frames(readings)
+        frames = self._instrument.frames_in_base(readings)
         base_T_rcm, base_T_shaft = frames[:, self._rcm_frame], frames[:, self._shaft_frame]
         shaft_T_rcm = rigid_inverse(base_T_shaft) @ base_T_rcm
         miss = float(shaft_T_rcm[:, :2, 3].norm(dim=-1).max())
@@ -186,9 +187,8 @@ class _Arm:
             found = f"{tuple(joints.shape)} of {joints.dtype}"
             raise ShapeError(where="joint readings", expected=expected, found=found)
 
-    def base_T_frames(self, joints: Float[Tensor, "*batch j"]) -> Float[Tensor, "*batch frames 4 4"]:
-        arm_base_T_frames = frame_poses(self._chain, joints + self._offsets)
-        return self._base_T_arm_base @ arm_base_T_frames
+    def frames_in_base(self, joints: Float[Tensor, "*batch j"]) -> Float[Tensor, "*batch frames 4 4"]:
+        return self._base_T_arm_base @ frame_poses(self._chain, joints + self._offsets)
 
 
 def _frame_number(number: int | None, table: ArmTable, where: str) -> int:

@@ -1,0 +1,120 @@
+"""Who may import whom, and what importing the package must not load."""
+
+import subprocess
+import sys
+import tomllib
+from itertools import product
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+CONFIGURATION = ROOT / "pyproject.toml"
+LINT = "import sys; from importlinter.cli import lint_imports; sys.exit(lint_imports(no_cache=True, verbose=False))"
+# Each takes from a tenth of a second to seconds to load.
+HEAVY = {"torch", "kornia", "cv2", "av", "matplotlib", "pytorch_kinematics", "scipy", "data_synth"}
+
+MODULES = [
+    "errors",
+    "geometry",
+    "kinematics",
+    "vision",
+    "io",
+    "solver",
+    "config",
+    "results",
+    "pipeline",
+    "report",
+    "cli",
+]
+
+
+def lint_imports(folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run the contracts of pyproject.toml on the packages in a folder, in a process of its own."""
+    return subprocess.run([sys.executable, "-c", LINT], cwd=folder, capture_output=True, text=True, check=False)
+
+
+def imported_by(statement: str) -> set[str]:
+    code = f"import sys\n{statement}\nprint(*{{name.split('.')[0] for name in sys.modules}})"
+    result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    return set(result.stdout.split())
+
+
+def test_contracts_hold() -> None:
+    result = lint_imports(ROOT)
+    assert result.returncode == 0, result.stdout
+    assert "0 broken" in result.stdout
+
+
+def test_contracts_say_what_the_design_says() -> None:
+    contracts = tomllib.loads(CONFIGURATION.read_text())["tool"]["importlinter"]["contracts"]
+    layers = next(contract["layers"] for contract in contracts if contract["type"] == "layers")
+    rows = [[name.strip(" ()") for name in row.split("|")] for row in layers]
+    assert rows == [
+        ["cli"],
+        ["batch", "studies", "report", "viewer"],
+        ["pipeline"],
+        ["results"],
+        ["config"],
+        ["solver"],
+        ["kinematics", "vision", "io"],
+        ["geometry"],
+        ["errors"],
+    ]
+    forbidden = set()
+    for contract in contracts:
+        if contract["type"] == "forbidden":
+            forbidden |= set(product(contract["source_modules"], contract["forbidden_modules"]))
+    assert ("data_synth", "rmis_calib") in forbidden
+    # `cli` and `studies` may use the generator. `batch` and `viewer` may not, and are listed when they exist.
+    below = {name for row in rows for name in row} - {"cli", "studies", "batch", "viewer"}
+    assert {(f"rmis_calib.{name}", "data_synth") for name in below} <= forbidden
+
+
+@pytest.mark.parametrize(
+    ("module", "statement", "broken"),
+    [
+        ("rmis_calib/geometry.py", "import rmis_calib.solver", "layers"),
+        ("rmis_calib/vision.py", "import rmis_calib.io", "layers"),
+        ("rmis_calib/kinematics.py", "def f():\n    from rmis_calib.io import x", "layers"),
+        ("rmis_calib/pipeline.py", "import rmis_calib.cli", "layers"),
+        ("rmis_calib/solver.py", "import data_synth", "only studies and cli use data_synth"),
+        ("data_synth/__init__.py", "import rmis_calib.geometry", "data_synth is made of its own code"),
+    ],
+)
+def test_contracts_break_when_they_should(tmp_path: Path, module: str, statement: str, broken: str) -> None:
+    modules = [f"rmis_calib/{name}.py" for name in MODULES]
+    for path in ["rmis_calib/__init__.py", "data_synth/__init__.py", *modules]:
+        (tmp_path / path).parent.mkdir(exist_ok=True)
+        (tmp_path / path).write_text("")
+    (tmp_path / "pyproject.toml").write_text(CONFIGURATION.read_text())
+    assert lint_imports(tmp_path).returncode == 0
+    (tmp_path / module).write_text(statement + "\n")
+    result = lint_imports(tmp_path)
+    assert result.returncode != 0
+    assert any(broken in line and "BROKEN" in line for line in result.stdout.splitlines()), result.stdout
+
+
+def test_importing_the_package_loads_nothing_heavy() -> None:
+    assert not imported_by("import rmis_calib") & HEAVY
+
+
+def test_settings_load_nothing_heavy() -> None:
+    paths = sorted(ROOT.glob("rmis_calib/**/settings.py"))
+    assert paths
+    for path in paths:
+        module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        assert not imported_by(f"import {module}") & HEAVY, module
+
+
+def test_subpackages_export_lazily() -> None:
+    for package in sorted(path.parent.name for path in ROOT.glob("rmis_calib/*/__init__.py")):
+        assert not imported_by(f"import rmis_calib.{package}") & HEAVY, package
+    code = "import rmis_calib.geometry as g; assert 'RigidTransform' in dir(g); g.RigidTransform"
+    assert "torch" in imported_by(code)
+
+
+def test_every_exported_name_exists() -> None:
+    for package in ("geometry", "kinematics"):
+        imported_by(f"import rmis_calib.{package} as p; [getattr(p, name) for name in p.__all__]")
