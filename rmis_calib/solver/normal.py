@@ -1,0 +1,185 @@
+"""Weighted normal equations: whiten every motion with the noise propagated from images and kinematics, and sum.
+
+The residuals of one motion have the covariance S = D + G: D diagonal, from the image; G from the motion's pose noise, which all rows share
+(`arm_T_rcm`) or the rows of one camera share (what each camera sees). In the form of residuals.py,
+G_ij = sigma_mm^2 w_i.w_j + sigma_rad^2 a_i.a_j. This is the Schur complement of a latent pose error per motion: eliminating xi from
+min |y - J xi|^2_D + |xi|^2_Sigma leaves y^T (D + J Sigma J^T)^-1 y.
+
+S is evaluated at the *predicted* rows of the current estimate and held while the score J^T S^-1 r is driven to zero.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rmis_calib.solver.measurements import END, HEAD, LINE, Packed
+from rmis_calib.solver.residuals import Rows, State, linearise
+from rmis_calib.solver.soa import eliminate, forward_substitute
+from rmis_calib.solver.unknowns import Layout, columns
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Variances of one solve, per trial; image variances as factors on the measurements' nominal ones."""
+
+    line: Float[Tensor, " b"]
+    end: Float[Tensor, " b"]
+    head: Float[Tensor, " b"]
+    kinematics_mm: Float[Tensor, " b"]
+    kinematics_rad: Float[Tensor, " b"]
+    camera_mm: Float[Tensor, " b"]
+    camera_rad: Float[Tensor, " b"]
+
+    def take(self, index: Tensor | slice) -> "NoiseModel":
+        return NoiseModel(**{name: value[index] for name, value in vars(self).items()})
+
+    def repeat(self, times: int) -> "NoiseModel":
+        return NoiseModel(**{name: value.repeat_interleave(times) for name, value in vars(self).items()})
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal equations of `b` trials, priors included.
+
+    Attributes:
+        H: information J^T S^-1 J.
+        g: score J^T S^-1 r; the Gauss-Newton step is -H^-1 g.
+        chi2: r^T S^-1 r.
+        rows: number of measured rows.
+        distance2: r^T S^-1 r of each motion.
+        factor: the eliminated systems, kept for `frozen_chi2` when asked for.
+    """
+
+    H: Float[Tensor, "b p p"]
+    g: Float[Tensor, "b p"]
+    chi2: Float[Tensor, " b"]
+    rows: Float[Tensor, " b"]
+    distance2: Float[Tensor, "b n"] | None = None
+    factor: Tensor | None = None
+
+
+def image_variance(packed: Packed, noise: NoiseModel) -> Float[Tensor, "k b n"]:
+    """D: nominal variances times the factor of each kind; 1 for rows that were not measured (they are zero)."""
+    factors = {LINE: noise.line, END: noise.end, HEAD: noise.head}
+    scale = torch.stack([factors[kind] for kind in packed.row_kind])
+    return torch.where(packed.rows_ok, packed.rows_var * scale[:, :, None], 1.0)
+
+
+def covariance(packed: Packed, rows: Rows, noise: NoiseModel, out: Tensor, weight: Tensor | None = None) -> None:
+    """Writes S into `out` (k, k, b, n). With a weight per camera and motion, that camera's block is inflated by 1/weight."""
+    for name, vectors in (("mm", rows.w), ("rad", rows.a)):
+        gram = out if name == "mm" else torch.empty_like(out)
+        torch.mul(vectors[0, :, None], vectors[0, None], out=gram)
+        for i in (1, 2):
+            gram.addcmul_(vectors[i, :, None], vectors[i, None])
+        kinematics, camera = getattr(noise, f"kinematics_{name}"), getattr(noise, f"camera_{name}")
+        if bool((camera > 0).any()) and packed.cameras > 1:
+            cameras = torch.tensor(packed.row_camera, device=out.device)
+            same = (cameras[:, None] == cameras[None]).to(out.dtype)
+            gram.mul_(kinematics[:, None] + same[:, :, None, None] * camera[:, None])
+        else:
+            gram.mul_((kinematics + camera)[:, None])
+        if name == "rad":
+            out.add_(gram)
+    out.diagonal(dim1=0, dim2=1).add_(image_variance(packed, noise).permute(1, 2, 0))
+    if weight is not None:
+        cameras = torch.tensor(packed.row_camera, device=out.device)
+        same = (cameras[:, None] == cameras[None]).to(out.dtype)[:, :, None, None]
+        out.mul_(1.0 + same * (1.0 / weight[cameras] - 1.0)[:, None])
+
+
+def normal_equations(
+    packed: Packed, state: State, layout: Layout, noise: NoiseModel, weight: Tensor | None = None, keep: bool = False
+) -> Normal:
+    """Normal equations of motions that fit into memory at once.
+
+    Args:
+        weight: (c, b, n) in (0, 1] of each camera's measurements of a motion.
+        keep: also return the factor and each motion's Mahalanobis distance.
+    """
+    rows, shaft = linearise(packed, state)
+    k, b, n = rows.r.shape
+    p = layout.size
+    augmented = torch.empty((k, k + p + 1, b, n), dtype=rows.r.dtype, device=rows.r.device)
+    covariance(packed, rows, noise, augmented[:, :k], weight)
+    augmented[:, k:-1] = columns(layout, rows, shaft, packed, state)
+    augmented[:, -1] = rows.r
+    eliminate(augmented)
+    pivots = augmented.diagonal(dim1=0, dim2=1).permute(2, 0, 1)  # (k, b, n)
+    white = augmented[:, k:] * pivots.rsqrt()[:, None]
+    gram = torch.matmul(white.permute(0, 2, 1, 3), white.permute(0, 2, 3, 1)).sum(0)  # (b, p + 1, p + 1)
+    return Normal(
+        H=gram[:, :p, :p],
+        g=gram[:, :p, p],
+        chi2=gram[:, p, p],
+        rows=packed.rows_ok.sum((0, 2)).to(gram.dtype),
+        distance2=white[:, -1].square().sum(0) if keep else None,
+        factor=augmented[:, :k].clone() if keep else None,
+    )
+
+
+def frozen_chi2(factor: Float[Tensor, "k k b n"], r: Float[Tensor, "k b n"]) -> Float[Tensor, "b n"]:
+    """r^T S^-1 r of each motion, for the S whose factor was kept."""
+    pivots = factor.diagonal(dim1=0, dim2=1).permute(2, 0, 1)
+    return (forward_substitute(factor, r).square() / pivots).sum(0)
+
+
+def with_prior(normal: Normal, layout: Layout, state: State) -> Normal:
+    """Adds the Gaussian priors."""
+    deviation, weight = layout.prior(state)
+    return replace(
+        normal,
+        H=normal.H + torch.diag_embed(weight),
+        g=normal.g + weight * deviation,
+        chi2=normal.chi2 + (weight * deviation.square()).sum(-1),
+    )
+
+
+def accumulate(
+    packed: Packed, state: State, layout: Layout, noise: NoiseModel, chunk: int, weight: Tensor | None = None
+) -> Normal:
+    """Normal equations with priors of any number of motions, `chunk` at a time: memory does not grow with N.
+
+    Motions stream: the sums over chunks are sums over machines just as well.
+    """
+    trials, motions = packed.trials, packed.motions
+    step_n = min(motions, chunk)
+    step_b = max(1, chunk // step_n)
+    per_trial = []
+    for b in range(0, trials, step_b):
+        bs = slice(b, min(b + step_b, trials))
+        part_state, part_layout, part_noise = state.take(bs), layout.take(bs), noise.take(bs)
+        total = None
+        for n in range(0, motions, step_n):
+            ns = slice(n, min(n + step_n, motions))
+            part = normal_equations(
+                packed.narrow(bs, ns), part_state, part_layout, part_noise, None if weight is None else weight[:, bs, ns]
+            )
+            total = part if total is None else _add(total, part)
+        per_trial.append(total)
+    joined = Normal(**{name: torch.cat([getattr(part, name) for part in per_trial]) for name in ("H", "g", "chi2", "rows")})
+    return with_prior(joined, layout, state)
+
+
+def _add(a: Normal, b: Normal) -> Normal:
+    return Normal(H=a.H + b.H, g=a.g + b.g, chi2=a.chi2 + b.chi2, rows=a.rows + b.rows)
+
+
+def camera_distance2(
+    packed: Packed, state: State, noise: NoiseModel
+) -> tuple[Float[Tensor, "c b n"], Float[Tensor, "c b n"]]:
+    """Mahalanobis distance^2 of each camera's measurements of a motion on their own, and how many rows they are."""
+    rows, _ = linearise(packed, state)
+    cameras = torch.tensor(packed.row_camera, device=rows.r.device)
+    full = torch.empty((len(cameras),) * 2 + rows.r.shape[1:], dtype=rows.r.dtype, device=rows.r.device)
+    covariance(packed, rows, noise, full)
+    distances, counts = [], []
+    for c in range(packed.cameras):
+        mine = torch.nonzero(cameras == c)[:, 0]
+        system = eliminate(torch.cat((full[mine][:, mine], rows.r[mine][:, None]), dim=1))
+        pivots = system.diagonal(dim1=0, dim2=1).permute(2, 0, 1)
+        distances.append((system[:, -1].square() / pivots).sum(0))
+        counts.append(packed.rows_ok[mine].sum(0).to(rows.r.dtype))
+    return torch.stack(distances), torch.stack(counts)

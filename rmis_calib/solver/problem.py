@@ -1,0 +1,269 @@
+"""What the solver sees: batched tensors of motions and measurements, checked once.
+
+Axes: any leading trial batch, then the camera (0 right, 1 left) where a tensor has one, then N motions. A measurement that is absent is
+NaN and not valid. Units: mm, rad, s; image coordinates are normalised and undistorted (x/z, y/z).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from rmis_calib.errors import InsufficientDataError, ObservationsError
+
+MIN_MOTIONS = 3
+CAMERAS = ("right", "left")
+
+
+@dataclass(frozen=True)
+class NoiseLevels:
+    """1-sigma noise levels per trial; NaN where unknown.
+
+    Attributes:
+        image: of an image point across its line, normalised units.
+        kinematics_mm: per axis, of the position of `arm_T_rcm` (right perturbation).
+        kinematics_rad: per axis, of its orientation.
+        camera_mm: per axis, of the pose that each camera sees, drawn anew for every motion and camera.
+        camera_rad: its orientation.
+        stereo_mm: per axis, of `camera_left_T_camera_right`, drawn once.
+        stereo_rad: its orientation.
+    """
+
+    image: Float[Tensor, "*batch"]
+    kinematics_mm: Float[Tensor, "*batch"]
+    kinematics_rad: Float[Tensor, "*batch"]
+    camera_mm: Float[Tensor, "*batch"]
+    camera_rad: Float[Tensor, "*batch"]
+    stereo_mm: Float[Tensor, "*batch"]
+    stereo_rad: Float[Tensor, "*batch"]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Motions of one calibration, or of a batch of trials.
+
+    Attributes:
+        arm_T_rcm: pose of the RCM frame in the laparoscope arm's end-effector frame.
+        rcm_v_axis: unit direction of the shaft, RCM to tip.
+        camera_T_camera_right: identity, then (with two cameras) `camera_left_T_camera_right`.
+        axis_xy: two points of the axis line, RCM side first, [camera, motion, point, xy].
+        axis_sigma: 1 sigma of each of these points across the line; NaN: the image noise.
+        contour_xy: [camera, motion, edge, point, xy]; edge 0 on the left-hand side of somebody who walks from the RCM side to the tip.
+        contour_sigma: [camera, motion, edge].
+        end_xy: the shaft's end on the axis; only its place along the axis is used.
+        end_sigma: along the axis.
+        head_xy: image of the head point.
+        head_sigma: per coordinate.
+        valid: motions in which this camera saw the shaft.
+        rcm_s_end_mm: nominal coordinate of the shaft's end along the axis from the RCM, known up to a constant.
+        rcm_p_head: the head point.
+        radius_mm: of the shaft; NaN when unknown (contours are then not used).
+        noise: levels, NaN where unknown.
+        joint_derivative: displacement of the shaft as a rigid body (rotation vector, translation; in `rcm`) per unit of each joint's
+            offset, [motion, 6, joint]; None when joint offsets cannot be estimated. A change of `rcm_v_axis` enters as
+            v x dv, a change of the insertion as v ds.
+        joint_offset_sigma: prior of each joint's offset, in its unit.
+        clock_derivative: the same displacement per second of clock offset, [motion, 6].
+    """
+
+    arm_T_rcm: Float[Tensor, "*batch n 4 4"]
+    rcm_v_axis: Float[Tensor, "*batch n 3"]
+    camera_T_camera_right: Float[Tensor, "*batch c 4 4"]
+    axis_xy: Float[Tensor, "*batch c n 2 2"]
+    axis_sigma: Float[Tensor, "*batch c n"]
+    contour_xy: Float[Tensor, "*batch c n 2 2 2"]
+    contour_sigma: Float[Tensor, "*batch c n 2"]
+    end_xy: Float[Tensor, "*batch c n 2"]
+    end_sigma: Float[Tensor, "*batch c n"]
+    head_xy: Float[Tensor, "*batch c n 2"]
+    head_sigma: Float[Tensor, "*batch c n"]
+    valid: Bool[Tensor, "*batch c n"]
+    rcm_s_end_mm: Float[Tensor, "*batch n"]
+    rcm_p_head: Float[Tensor, "*batch n 3"]
+    radius_mm: Float[Tensor, "*batch"]
+    noise: NoiseLevels
+    joint_derivative: Float[Tensor, "*batch n 6 j"] | None = None
+    joint_offset_sigma: Float[Tensor, "*batch j"] | None = None
+    clock_derivative: Float[Tensor, "*batch n 6"] | None = None
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        return self.arm_T_rcm.shape[:-3]
+
+    @property
+    def n_motions(self) -> int:
+        return self.arm_T_rcm.shape[-3]
+
+    @property
+    def n_cameras(self) -> int:
+        return self.camera_T_camera_right.shape[-3]
+
+    @property
+    def n_trials(self) -> int:
+        return self.batch_shape.numel()
+
+    def only(self, *kinds: str) -> "Problem":
+        """The problem with these kinds of measurement alone (`axis`, `contours`, `ends`, `heads`)."""
+        names = {"axis": "axis_xy", "contours": "contour_xy", "ends": "end_xy", "heads": "head_xy"}
+        dropped = {name: torch.full_like(getattr(self, name), torch.nan) for kind, name in names.items() if kind not in kinds}
+        return replace(self, **dropped)
+
+    def cameras(self, count: int) -> "Problem":
+        """The problem seen by the first `count` cameras."""
+        start = len(self.batch_shape)
+        names = ("camera_T_camera_right", "valid", *(f"{k}_{s}" for k in ("axis", "contour", "end", "head") for s in ("xy", "sigma")))
+        return replace(self, **{name: getattr(self, name).narrow(start, 0, count) for name in names})
+
+    def select_motions(self, index: Tensor) -> "Problem":
+        """The problem of the motions `index`, a tensor of positions or a mask, the same for every trial."""
+        return self._map_motions(lambda x, dim: x[(slice(None),) * dim + (index,)])
+
+    def flatten_batch(self) -> "Problem":
+        """The same with exactly one leading axis of trials."""
+        k = len(self.batch_shape)
+
+        def flat(x: Tensor) -> Tensor:
+            return x.reshape(self.n_trials, *x.shape[k:])
+
+        return _map_tensors(self, lambda x, _: flat(x))
+
+    def _map_motions(self, function: Any) -> "Problem":
+        k = len(self.batch_shape)
+        after_camera = {"axis_xy", "axis_sigma", "contour_xy", "contour_sigma", "end_xy", "end_sigma", "head_xy", "head_sigma", "valid"}
+        constant = {"camera_T_camera_right", "radius_mm", "joint_offset_sigma"}
+        changed = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, Tensor) and field.name not in constant:
+                changed[field.name] = function(value, k + (field.name in after_camera))
+        return replace(self, **changed)
+
+    @classmethod
+    def from_observations(cls, observations: Any, dtype: torch.dtype = torch.float64, device: str = "cpu") -> "Problem":
+        """From an object with the keys of an observations file as attributes (`io.observations.ShaftObservations`)."""
+        return cls.from_arrays({key: getattr(observations, key, None) for key in OBSERVATION_KEYS}, dtype, device)
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, Any], dtype: torch.dtype = torch.float64, device: str = "cpu") -> "Problem":
+        """From arrays in the keys of an observations file, any leading trial batch.
+
+        Edges of contours are put into the canonical order. Missing arrays become NaN, missing noise levels NaN (unknown).
+
+        Raises:
+            ObservationsError: a key is missing or an array has the wrong shape.
+            InsufficientDataError: fewer than 3 motions.
+        """
+        return _Reader(arrays, dtype, device).problem()
+
+
+OBSERVATION_KEYS = (
+    "arm_T_rcm", "rcm_v_axis", "camera_left_T_camera_right", "axis_right", "axis_left", "contour_right", "contour_left",
+    "shaft_radius_mm", "end_right", "end_left", "rcm_s_end_mm", "head_right", "head_left", "rcm_p_head", "valid_right", "valid_left",
+    "sigma_image", "sigma_kinematics_mm", "sigma_kinematics_rad", "sigma_camera_mm", "sigma_camera_rad", "sigma_stereo_mm",
+    "sigma_stereo_rad", "sigma_axis_right", "sigma_axis_left", "sigma_contour_right", "sigma_contour_left", "sigma_end_right",
+    "sigma_end_left", "sigma_head_right", "sigma_head_left",
+)  # fmt: skip
+
+
+class _Reader:
+    """Turns a mapping of arrays into tensors of known shapes."""
+
+    def __init__(self, arrays: Mapping[str, Any], dtype: torch.dtype, device: str) -> None:
+        self.arrays, self.dtype, self.device = arrays, dtype, device
+        self.poses = self.tensor("arm_T_rcm")
+        if self.poses.ndim < 3 or self.poses.shape[-2:] != (4, 4):
+            raise ObservationsError(where="arm_T_rcm", expected="shape (..., N, 4, 4)", found=tuple(self.poses.shape))
+        self.batch, self.n = self.poses.shape[:-3], self.poses.shape[-3]
+        if self.n < MIN_MOTIONS:
+            raise InsufficientDataError(where="arm_T_rcm", expected=f"at least {MIN_MOTIONS} motions", found=self.n)
+        self.sides = CAMERAS if arrays.get("camera_left_T_camera_right") is not None and self._seen("left") else CAMERAS[:1]
+
+    def _seen(self, side: str) -> bool:
+        return any(self.arrays.get(f"{kind}_{side}") is not None for kind in ("axis", "contour", "head"))
+
+    def tensor(self, key: str) -> Tensor:
+        value = self.arrays.get(key)
+        if value is None:
+            raise ObservationsError(where=key, expected="an array", found="nothing")
+        return torch.as_tensor(value, dtype=self.dtype, device=self.device)
+
+    def filled(self, key: str, *tail: int) -> Tensor:
+        """The array broadcast to (*batch, *tail), or NaN."""
+        shape = (*self.batch, *tail)
+        if self.arrays.get(key) is None:
+            return torch.full(shape, torch.nan, dtype=self.dtype, device=self.device)
+        value = self.tensor(key)
+        if value.ndim == 0 or (not tail and value.shape == ()):
+            return value.expand(shape).clone()
+        if value.shape != shape:
+            raise ObservationsError(where=key, expected=f"shape {shape}", found=tuple(value.shape))
+        return value
+
+    def both(self, name: str, *tail: int) -> Tensor:
+        return torch.stack([self.filled(name.format(side), self.n, *tail) for side in self.sides], dim=len(self.batch))
+
+    def noise(self) -> NoiseLevels:
+        levels = {field.name: self.filled(f"sigma_{field.name}") for field in fields(NoiseLevels)}
+        for name in ("camera_mm", "camera_rad"):
+            levels[name] = torch.nan_to_num(levels[name], nan=0.0)
+        return NoiseLevels(**levels)
+
+    def problem(self) -> Problem:
+        axis, contour = self.both("axis_{}", 2, 2), self.both("contour_{}", 2, 2, 2)
+        valid = torch.stack([self._valid(side) for side in self.sides], dim=len(self.batch))
+        eye = torch.eye(4, dtype=self.dtype, device=self.device).expand(*self.batch, 4, 4)
+        cameras = [eye] + ([self.filled("camera_left_T_camera_right", 4, 4)] if len(self.sides) == 2 else [])
+        v = self.filled("rcm_v_axis", self.n, 3)
+        if not bool((torch.linalg.vector_norm(v, dim=-1) > 1e-9).all()):
+            raise ObservationsError(where="rcm_v_axis", expected="finite unit directions", found="a zero or non-finite one")
+        return Problem(
+            arm_T_rcm=self.poses,
+            rcm_v_axis=v / torch.linalg.vector_norm(v, dim=-1, keepdim=True),
+            camera_T_camera_right=torch.stack(cameras, dim=-3),
+            axis_xy=axis,
+            axis_sigma=self.both("sigma_axis_{}"),
+            contour_xy=_canonical_edges(contour, axis),
+            contour_sigma=self.both("sigma_contour_{}", 2),
+            end_xy=self.both("end_{}", 2),
+            end_sigma=self.both("sigma_end_{}"),
+            head_xy=self.both("head_{}", 2),
+            head_sigma=self.both("sigma_head_{}"),
+            valid=valid,
+            rcm_s_end_mm=self.filled("rcm_s_end_mm", self.n),
+            rcm_p_head=self.filled("rcm_p_head", self.n, 3),
+            radius_mm=self.filled("shaft_radius_mm"),
+            noise=self.noise(),
+        )
+
+    def _valid(self, side: str) -> Tensor:
+        value = self.arrays.get(f"valid_{side}")
+        if value is None:
+            return torch.ones((*self.batch, self.n), dtype=torch.bool, device=self.device)
+        return torch.as_tensor(value, dtype=torch.bool, device=self.device).expand(*self.batch, self.n)
+
+
+def _canonical_edges(
+    contour_xy: Float[Tensor, "*batch 2 2 2"], axis_xy: Float[Tensor, "*batch 2 2"]
+) -> Float[Tensor, "*batch 2 2 2"]:
+    """Edges swapped where edge 0 does not lie on the left-hand side (x right, y down) of the direction from the RCM side to the tip."""
+    along = torch.where(torch.isfinite(axis_xy).all(-1).all(-1)[..., None], axis_xy[..., 1, :] - axis_xy[..., 0, :], torch.nan)
+    own = (contour_xy[..., 1, :] - contour_xy[..., 0, :]).sum(-2)
+    along = torch.where(torch.isfinite(along), along, own)
+    across = contour_xy[..., 0, :, :].mean(-2) - contour_xy[..., 1, :, :].mean(-2)
+    turn = along[..., 0] * across[..., 1] - along[..., 1] * across[..., 0]
+    return torch.where((turn > 0)[..., None, None, None], contour_xy.flip(-3), contour_xy)
+
+
+def _map_tensors(value: Any, function: Any) -> Any:
+    """A dataclass with `function(tensor, name)` applied to every tensor in it."""
+    changed = {}
+    for field in fields(value):
+        item = getattr(value, field.name)
+        if isinstance(item, Tensor):
+            changed[field.name] = function(item, field.name)
+        elif isinstance(item, NoiseLevels):
+            changed[field.name] = _map_tensors(item, function)
+    return replace(value, **changed)

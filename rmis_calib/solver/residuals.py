@@ -1,0 +1,263 @@
+"""Residuals of lines, contours, ends and head points, with their analytic Jacobians.
+
+**Geometry** (DESIGN.md, section 4). In a camera's frame let p be the RCM, d the shaft's direction (RCM to tip), M = p x d, D = |M| the
+distance of the axis from the optical centre, m = M/D, u = d x m the unit vector from the optical centre to the axis' nearest point
+c = D u, and s0 = p.d, so that p = D u + s0 d. A plane through the optical centre that touches a cylinder of radius r about the axis has
+the unit normal n with n.d = 0 and n.p = rho r, rho = +1 or -1 for the two contours: n = cos(alpha) m + rho sin(alpha) u, sin(alpha) = r/D.
+The axis itself is rho = 0, n = m.
+
+**Line row.** For a measured image point, X = (x, y, 1), f = n.X / |n_xy| is its signed distance from the predicted line, and one unit of
+noise across the line is one unit of f. Move the shaft rigidly, so that a point of it at coordinate s from the RCM moves by
+delta(s) = dp + s dd, and let r grow by dr. Differentiating n.d = 0 and n.p = rho r gives dn = -(n.dd) d + e t with t = cos(alpha) u -
+rho sin(alpha) m, t.p = D cos(alpha), and e = (rho dr - n.dp + s0 n.dd) / (D cos(alpha)). With T = t.X the ray X touches the cylinder at
+s_X = X_d D cos(alpha) / T - s0 from the RCM, and all terms collect into
+
+    df = kappa (rho dr - n . delta(s_X)),      kappa = T / (D cos(alpha) |n_xy|):
+
+the contour moves by what the touched point moves along the normal, seen at its depth. (|n_xy| multiplies f and is held: its derivative is
+of second order at a small residual.)
+
+**End row.** chi = X_d / X_u is the tangent of the angle in the axis plane between u and the measured end's ray, which meets the axis at
+D chi - s0 from the RCM. The residual is chi - (s0 + s_e)/D, divided by |d chi / d g| for a step g along the imaged axis, so that noise along
+the axis has unit effect. Moving the shaft by delta moves the ray's meeting point by chi (u.delta) - d.delta along it:
+
+    de = -(d - chi u) . delta(s_e) / (D |d chi / d g|),      and d e / d s_e = -1 / (D |d chi / d g|).
+
+**Head row.** y - pi(q), q the head point, pi the pinhole: de = -J_pi(q) dq.
+
+**One form for all rows.** A rigid motion of the shaft (rotation phi about the RCM, translation tau) moves a point at the vector h from the
+RCM by tau + phi x h. So each row is w.(tau + phi x h) = w.tau + a.phi with a = h x w, h = s d for lines and ends. From (w, a) follow
+ - a change of the hand-eye transform, R <- exp(dphi) R, t <- t + dt: phi = dphi, tau = dphi x (p - t) + dt, so the columns are
+   (p - t) x w + a and w; the stereo extrinsics, perturbed on the right like their noise, have p x w + a and w in the rows of the left camera;
+ - noise of `arm_T_rcm`: isotropic, so its covariance of rows i, j is sigma_mm^2 w_i.w_j + sigma_rad^2 a_i.a_j in any frame;
+ - joint offsets, clock and RCM offset: w.tau + a.phi of the displacement that they cause.
+So every nuisance and every noise source costs scalar products only. `tests/solver/test_residuals.py` holds all of this against
+`torch.func.jacrev`.
+"""
+
+from dataclasses import dataclass, fields, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rmis_calib.geometry.rotations import rotvec_to_matrix
+from rmis_calib.solver.measurements import Packed
+from rmis_calib.solver.soa import batch_last, cross, dot, rotate, rotate_back, unit
+
+MAX_SINE = 0.99
+"""Clamp of r/D. A shaft nearer than that would touch the lens; only trial steps get there."""
+MIN_COSINE = 1e-6
+"""Smallest T and X_u divided by: a ray along the axis meets it nowhere."""
+
+
+@dataclass(frozen=True)
+class State:
+    """Estimates of `b` trials. The offsets are zero where they are not estimated.
+
+    Attributes:
+        R: `camera_right_R_arm`.
+        t: `camera_right_t_arm`, mm.
+        stereo_R: `camera_left_R_camera_right`.
+        stereo_t: its translation, mm.
+        radius: of the shaft, mm.
+        end_offset: of the shaft's end along the axis, mm.
+        rcm_offset: of the shaft's axis from the nominal RCM, along two directions across the axis, mm.
+        joint_offset: in each joint's unit.
+        clock: seconds added to the time at which the joints were read.
+    """
+
+    R: Float[Tensor, "b 3 3"]
+    t: Float[Tensor, "b 3"]
+    stereo_R: Float[Tensor, "b 3 3"]
+    stereo_t: Float[Tensor, "b 3"]
+    radius: Float[Tensor, " b"]
+    end_offset: Float[Tensor, " b"]
+    rcm_offset: Float[Tensor, "b 2"]
+    joint_offset: Float[Tensor, "b j"]
+    clock: Float[Tensor, " b"]
+
+    def where(self, chosen: Tensor, other: "State") -> "State":
+        """This state in the chosen trials, `other` elsewhere."""
+
+        def pick(a: Tensor, b: Tensor) -> Tensor:
+            return torch.where(chosen.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
+
+        return State(**{f.name: pick(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)})
+
+    def take(self, index: Tensor | slice) -> "State":
+        """The state of the trials `index`."""
+        return State(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+    def moved(self, step: dict[str, Tensor]) -> "State":
+        """The state after a step, given by parameter block (`unknowns.Layout.blocks`)."""
+        changed = {}
+        if "rotation" in step:
+            changed["R"] = rotvec_to_matrix(step["rotation"]) @ self.R
+        if "stereo_rotation" in step:
+            changed["stereo_R"] = self.stereo_R @ rotvec_to_matrix(step["stereo_rotation"])
+        if "stereo_translation" in step:
+            changed["stereo_t"] = self.stereo_t + (self.stereo_R @ step["stereo_translation"][..., None])[..., 0]
+        for block, name in (("translation", "t"), ("rcm_offset", "rcm_offset"), ("joint_offset", "joint_offset")):
+            if block in step:
+                changed[name] = getattr(self, name) + step[block]
+        for name in ("radius", "end_offset", "clock"):
+            if name in step:
+                changed[name] = getattr(self, name) + step[name][:, 0]
+        return replace(self, **changed)
+
+
+@dataclass(frozen=True)
+class Shaft:
+    """Predicted shaft in every camera's frame, component first: p, d, m, u (3, c, b, n), D and s0 (c, b, n)."""
+
+    p: Float[Tensor, "3 c b n"]
+    d: Float[Tensor, "3 c b n"]
+    m: Float[Tensor, "3 c b n"]
+    u: Float[Tensor, "3 c b n"]
+    D: Float[Tensor, "c b n"]
+    s0: Float[Tensor, "c b n"]
+    head: Float[Tensor, "3 c b n"]
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Residuals and first-order effects of a rigid motion of the shaft, in `camera_right`; rows of absent measurements are zero.
+
+    Attributes:
+        r: residuals, normalised image units.
+        w: effect of a translation of the shaft.
+        a: effect of a rotation of the shaft about the RCM.
+        radius: effect of the radius.
+        end: effect of the end offset.
+    """
+
+    r: Float[Tensor, "k b n"]
+    w: Float[Tensor, "3 k b n"]
+    a: Float[Tensor, "3 k b n"]
+    radius: Float[Tensor, "k b n"]
+    end: Float[Tensor, "k b n"]
+
+
+def camera_rotations(packed: Packed, state: State) -> tuple[Float[Tensor, "3 3 c b 1"], Float[Tensor, "3 c b 1"]]:
+    """`camera_T_camera_right` of the state, batch last."""
+    R, t = packed.camera_R, packed.camera_t
+    if packed.cameras == 2:
+        R = torch.stack((R[:, :, 0], batch_last(state.stereo_R, 2)), dim=2)
+        t = torch.stack((t[:, 0], batch_last(state.stereo_t, 1)), dim=1)
+    return R[..., None], t[..., None]
+
+
+def rcm_axes(packed: Packed) -> tuple[Float[Tensor, "3 b n"], Float[Tensor, "3 b n"]]:
+    """Two unit directions across the shaft, fixed to `rcm`, in `arm`: x of `rcm` made perpendicular to the axis (y where x is
+    nearer to the axis than y), and the axis times it."""
+    x_along, y_along = dot(packed.R[:, 0], packed.v), dot(packed.R[:, 1], packed.v)
+    first = torch.where((x_along.abs() > y_along.abs()), packed.R[:, 1], packed.R[:, 0])
+    e1 = unit(first - dot(first, packed.v) * packed.v)
+    return e1, cross(packed.v, e1)
+
+
+def predict_shaft(packed: Packed, state: State) -> Shaft:
+    """The shaft in the frame of each camera."""
+    arm_p, arm_v, arm_head = _corrected(packed, state)
+    R, t = batch_last(state.R, 2)[..., None], batch_last(state.t, 1)[..., None]
+    camera_R, camera_t = camera_rotations(packed, state)
+    p = rotate(camera_R, (rotate(R, arm_p) + t)[:, None]) + camera_t
+    d = rotate(camera_R, rotate(R, arm_v)[:, None])
+    M = cross(p, d)
+    D = dot(M, M).sqrt().clamp_min(1e-9)
+    m = M / D
+    head = rotate(camera_R, rotate(R, arm_head)[:, None]) if packed.has_heads else d
+    return Shaft(p=p, d=d, m=m, u=cross(d, m), D=D, s0=dot(p, d), head=head)
+
+
+def _corrected(packed: Packed, state: State) -> tuple[Tensor, Tensor, Tensor]:
+    """RCM, direction and head vector in `arm` with the estimated offsets applied, to first order in the rotation."""
+    p, v, head = packed.p, packed.v, packed.head
+    if bool((state.rcm_offset != 0).any()):
+        e1, e2 = rcm_axes(packed)
+        p = p + state.rcm_offset[:, 0, None] * e1 + state.rcm_offset[:, 1, None] * e2
+    displacement = None
+    if packed.joint is not None and bool((state.joint_offset != 0).any()):
+        displacement = (packed.joint * state.joint_offset.T[:, :, None]).sum(1)
+    if packed.clock is not None and bool((state.clock != 0).any()):
+        moved = packed.clock * state.clock[:, None]
+        displacement = moved if displacement is None else displacement + moved
+    if displacement is not None:
+        p = p + displacement[3:]
+        v = unit(v + cross(displacement[:3], v))
+        head = head + cross(displacement[:3], head)
+    return p, v, head
+
+
+def residual_rows(packed: Packed, state: State) -> Float[Tensor, "k b n"]:
+    """Residuals alone."""
+    shaft = predict_shaft(packed, state)
+    parts = [_line_geometry(packed, state, shaft)[0].flatten(0, 1)]
+    if packed.has_ends:
+        parts.append(_end_geometry(packed, state, shaft)[0])
+    if packed.has_heads:
+        parts.append(_head_geometry(packed, shaft)[0].flatten(0, 1))
+    return torch.where(packed.rows_ok, torch.cat(parts), 0.0)
+
+
+def linearise(packed: Packed, state: State) -> tuple[Rows, Shaft]:
+    """Residuals with their effects of a rigid motion of the shaft."""
+    shaft = predict_shaft(packed, state)
+    f, n, kappa, kappa_s, _ = _line_geometry(packed, state, shaft)
+    w = -kappa * n
+    a = -kappa_s * cross(shaft.d[:, None], n)
+    parts = [(f, w, a, kappa * packed.line_rho, torch.zeros_like(f))]
+    if packed.has_ends:
+        e, w, s, gain = _end_geometry(packed, state, shaft)
+        parts.append(tuple(x.unsqueeze(x.ndim - 3) for x in (e, w, s * cross(shaft.d, w), torch.zeros_like(e), -gain)))
+    if packed.has_heads:
+        e, w = _head_geometry(packed, shaft)
+        zero = torch.zeros_like(e)
+        parts.append((e, w, cross(shaft.head[:, None].expand_as(w), w), zero, zero))
+    camera_R, _ = camera_rotations(packed, state)
+    ok = packed.rows_ok
+
+    def joined(i: int, vector: bool) -> Tensor:
+        pieces = [rotate_back(camera_R[:, :, None], part[i]).flatten(1, 2) if vector else part[i].flatten(0, 1) for part in parts]
+        return torch.where(ok, torch.cat(pieces, dim=1 if vector else 0), 0.0)
+
+    return Rows(r=joined(0, False), w=joined(1, True), a=joined(2, True), radius=joined(3, False), end=joined(4, False)), shaft
+
+
+def _line_geometry(packed: Packed, state: State, shaft: Shaft) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """f (l, c, b, n), the normal n (3, l, c, b, n), kappa, kappa s_X, and |n_xy|."""
+    x, y = packed.line_xy
+    sine = (packed.line_rho * (state.radius[:, None] / shaft.D)).clamp(-MAX_SINE, MAX_SINE)
+    cosine = (1.0 - sine.square()).sqrt()
+    n = torch.addcmul(cosine * shaft.m[:, None], sine, shaft.u[:, None])
+    n_xy = (n[0].square() + n[1].square()).sqrt().clamp_min(1e-12)
+    f = (n[0] * x + n[1] * y + n[2]) / n_xy
+    X_u, X_m, X_d = (axis[0] * x + axis[1] * y + axis[2] for axis in (shaft.u, shaft.m, shaft.d))
+    kappa = (cosine * X_u - sine * X_m) / (shaft.D * cosine * n_xy)
+    return f, n, kappa, X_d / n_xy - kappa * shaft.s0, n_xy
+
+
+def _end_geometry(packed: Packed, state: State, shaft: Shaft) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """e (c, b, n), w (3, c, b, n), s_e (c, b, n) and d e / d s_e without its sign."""
+    x, y = packed.end_xy
+    u, d, m = shaft.u, shaft.d, shaft.m
+    X_u, X_d = (axis[0] * x + axis[1] * y + axis[2] for axis in (u, d))
+    X_u = torch.where(X_u.abs() < MIN_COSINE, MIN_COSINE, X_u)
+    chi = X_d / X_u
+    m_xy = (m[0].square() + m[1].square()).sqrt().clamp_min(1e-12)
+    along = (-m[1] / m_xy, m[0] / m_xy)
+    slope = ((d[0] - chi * u[0]) * along[0] + (d[1] - chi * u[1]) * along[1]).abs().clamp_min(1e-12) / X_u.abs()
+    s_end = packed.s_end + state.end_offset[:, None] + torch.zeros_like(chi)
+    gain = 1.0 / (shaft.D * slope)
+    return (chi - (shaft.s0 + s_end) / shaft.D) / slope, -gain * (d - chi * u), s_end, gain
+
+
+def _head_geometry(packed: Packed, shaft: Shaft) -> tuple[Tensor, Tensor]:
+    """e (2, c, b, n) and w (3, 2, c, b, n)."""
+    q = shaft.p + shaft.head
+    depth = torch.where(q[2].abs() < MIN_COSINE, MIN_COSINE, q[2])
+    x, y, zero = q[0] / depth, q[1] / depth, torch.zeros_like(depth)
+    e = torch.stack((packed.head_xy[0] - x, packed.head_xy[1] - y))
+    w = torch.stack((torch.stack((-1.0 / depth, zero)), torch.stack((zero, -1.0 / depth)), torch.stack((x / depth, y / depth))))
+    return e, w

@@ -1,0 +1,119 @@
+"""Settings of the solver. Importing this module imports neither torch nor anything heavy."""
+
+from typing import Annotated, Literal
+
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+Positive = Annotated[float, Field(gt=0.0)]
+NotNegative = Annotated[float, Field(ge=0.0)]
+Count = Annotated[int, Field(ge=1)]
+_STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+@dataclass(frozen=True, config=_STRICT)
+class NoiseSettings:
+    """Noise levels: what is assumed when the observations name none, and whether they are estimated."""
+
+    estimate: Literal["auto", "always", "never"] = "auto"
+    """Variance components from the data: `auto` estimates those levels that the observations leave open."""
+    image: Positive = 7e-4
+    """Assumed 1 sigma of an image point across its line, normalised units (0.7 px at f = 1000 px)."""
+    kinematics_mm: Positive = 0.3
+    """Assumed 1 sigma per axis of the position of `arm_T_rcm`."""
+    kinematics_deg: Positive = 0.1
+    """Assumed 1 sigma per axis of its orientation."""
+    prior_factor: Positive = 3.0
+    """An estimated level lies within this factor of the assumed one, 1 sigma of its logarithm."""
+    stereo_mm: NotNegative = 0.1
+    """Assumed 1 sigma per axis of the stereo translation."""
+    stereo_deg: NotNegative = 0.1
+    """Assumed 1 sigma per axis of the stereo rotation."""
+
+
+@dataclass(frozen=True, config=_STRICT)
+class UnknownSettings:
+    """Unknowns beside the transform. Each has a Gaussian prior; a prior of zero holds the value."""
+
+    stereo: bool = True
+    """Refine `camera_left_T_camera_right` within the stereo noise."""
+    radius: bool = True
+    """Refine the shaft radius, where contours are measured."""
+    radius_sigma_relative: NotNegative = 0.03
+    """Prior of the radius, as a part of it. 8.0 to 8.5 mm are all in use for "8 mm" shafts."""
+    end_offset: bool = True
+    """Estimate one constant offset of the shaft's end along the axis, where ends are measured."""
+    end_offset_sigma_mm: NotNegative = 30.0
+    """Prior of that offset."""
+    rcm_offset: bool = False
+    """Estimate by how much the shaft's axis misses the nominal RCM, two components across the axis, fixed to `rcm`."""
+    rcm_offset_sigma_mm: NotNegative = 2.0
+    """Prior of each component."""
+    joint_offsets: bool = False
+    """Estimate constant joint offsets; needs the derivatives of the kinematics in the problem."""
+    joint_offset_sigma_deg: NotNegative = 1.0
+    """Prior of the offset of a revolute joint."""
+    joint_offset_sigma_mm: NotNegative = 2.0
+    """Prior of the offset of a prismatic joint."""
+    clock: bool = False
+    """Estimate the clock offset between video and joints; needs the velocities in the problem."""
+    clock_sigma_s: NotNegative = 0.1
+    """Prior of the clock offset about the value that the joints were interpolated with."""
+    held_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.95
+    """An unknown whose sigma the data do not bring below this part of its prior is reported as held."""
+
+
+@dataclass(frozen=True, config=_STRICT)
+class VerdictSettings:
+    """When a calibration is trustworthy: the predicted error (1 sigma, root of the trace) where the instrument works."""
+
+    working_point_mm: tuple[float, float, float] | None = None
+    """Point in the right camera's frame at which the error counts; default: the mean measured shaft end or head point."""
+    trustworthy_mm: Positive = 2.0
+    """Predicted error at the working point below which the result is `trustworthy`."""
+    unobservable_mm: Positive = 6.0
+    """Predicted error above which the transform is `unobservable`; between the two it is `weak`."""
+    trustworthy_deg: Positive = 1.5
+    """Predicted rotation error below which the result is `trustworthy`."""
+    unobservable_deg: Positive = 6.0
+    """Predicted rotation error above which it is `unobservable`."""
+    lever_mm: Positive = 50.0
+    """Length that turns a rotation into a displacement when directions are ranked: about the visible part of the shaft."""
+
+
+@dataclass(frozen=True, config=_STRICT)
+class SolverSettings:
+    """Everything the solver can be told."""
+
+    method: Literal["paper", "global", "joint"] = "joint"
+    """`paper`: as published; `global`: covering grid on SO(3), then translation; `joint`: weighted estimate of everything."""
+    unknowns: UnknownSettings = UnknownSettings()
+    """What is estimated beside the transform (`joint`)."""
+    noise: NoiseSettings = NoiseSettings()
+    """Noise levels (`joint`)."""
+    verdict: VerdictSettings = VerdictSettings()
+    """Thresholds of the verdict."""
+    robust: Literal["auto", "on", "off"] = "auto"
+    """Outlier rejection by graduated non-convexity: `auto` where the first fit shows measurements that noise does not explain."""
+    outlier_probability: Annotated[float, Field(gt=0.0, lt=0.5)] = 1e-4
+    """Chance of rejecting a good measurement (of one camera in one motion)."""
+    bias_correction: bool = True
+    """Subtract the second-order bias of errors in variables, from antithetic simulations at the estimate."""
+    bias_motions: Count = 4096
+    """Simulated motions that the bias is averaged over; more than N repeats motions with other noise."""
+    grid: Annotated[int, Field(ge=24, le=20000)] = 576
+    """Rotations of the covering grid."""
+    minima: Annotated[int, Field(ge=1, le=64)] = 8
+    """Distinct minima of the rotation cost that compete."""
+    max_iterations: Count = 50
+    """Steps of each refinement."""
+    tolerance_sigma: Positive = 1e-3
+    """Converged when the proposed step is below this part of the standard error in every direction: step^T H step < tolerance^2."""
+    start_motions: Count = 256
+    """Motions that the starts compete on; all motions refine the winner."""
+    thin_to: Count | None = None
+    """Keep only this many most informative motions (D-optimal); the loss in information is stated."""
+    chunk: Annotated[int, Field(ge=256)] = 8192
+    """Motions (times trials) that are in work at once: bounds memory."""
+    seed: int = 0
+    """Seed of the simulations of the bias correction."""

@@ -1,0 +1,195 @@
+"""What a solve returns: the estimate, its uncertainty, a status with a sentence, and what the data cannot see."""
+
+from dataclasses import dataclass
+from enum import IntEnum, StrEnum
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+
+class SolveStatus(IntEnum):
+    """How a solve ended. `.sentence` says it in words."""
+
+    CONVERGED = 0
+    MAX_ITERATIONS = 1
+    STALLED = 2
+    NON_FINITE = 3
+    SINGULAR = 4
+    BEHIND_CAMERA = 5
+    INCONSISTENT = 6
+
+    @property
+    def sentence(self) -> str:
+        return _SENTENCES[self]
+
+
+_SENTENCES = {
+    SolveStatus.CONVERGED: "converged",
+    SolveStatus.MAX_ITERATIONS: "ran out of steps before the estimate settled",
+    SolveStatus.STALLED: "no step improved the fit although it had not settled",
+    SolveStatus.NON_FINITE: "a residual became infinite or undefined",
+    SolveStatus.SINGULAR: "the measurements leave a direction of the unknown entirely free",
+    SolveStatus.BEHIND_CAMERA: "the best fit puts the shaft behind the camera or its tip on the wrong side",
+    SolveStatus.INCONSISTENT: "fewer than half of the measurements agree with any single transform",
+}
+
+
+class Verdict(StrEnum):
+    """Whether the predicted error at the working point is small enough to use the result."""
+
+    TRUSTWORTHY = "trustworthy"
+    WEAK = "weak"
+    UNOBSERVABLE = "unobservable"
+
+
+class MotionReason(IntEnum):
+    """Why a motion was or was not used."""
+
+    USED = 0
+    NOT_MEASURED = 1
+    OUTLIER = 2
+    OUTLIER_ONE_CAMERA = 3
+    THINNED = 4
+
+    @property
+    def sentence(self) -> str:
+        return _REASONS[self]
+
+
+_REASONS = {
+    MotionReason.USED: "used",
+    MotionReason.NOT_MEASURED: "no camera measured the shaft",
+    MotionReason.OUTLIER: "does not fit the other motions",
+    MotionReason.OUTLIER_ONE_CAMERA: "used from one camera; the other camera's measurement does not fit",
+    MotionReason.THINNED: "left out: other motions carry nearly all the information",
+}
+
+
+@dataclass(frozen=True)
+class Nuisance:
+    """An unknown that was estimated beside the transform: value, 1 sigma, unit, and whether the data could tell it at all."""
+
+    value: Float[Tensor, "*batch k"]
+    sigma: Float[Tensor, "*batch k"]
+    unit: str
+    held: Bool[Tensor, "*batch k"]
+
+
+@dataclass(frozen=True)
+class Observability:
+    """What the data can see, for one trial.
+
+    Attributes:
+        verdict: from the predicted errors and the thresholds of the settings.
+        working_point_mm: where the error counts, in `camera_right`.
+        working_point_sigma_mm: predicted error there, root of the trace.
+        rotation_sigma_deg: predicted rotation error, root of the trace.
+        directions: the principal directions, worst first: (1 sigma in mm at the working point, sentence).
+        degeneracies: names of the classical degenerate cases that were recognised.
+        sentence: one line for a report.
+    """
+
+    verdict: Verdict
+    working_point_mm: tuple[float, float, float]
+    working_point_sigma_mm: float
+    rotation_sigma_deg: float
+    directions: tuple[tuple[float, str], ...]
+    degeneracies: tuple[str, ...]
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Sight:
+    """Observability of every trial, as tensors.
+
+    Attributes:
+        working_point_mm: where the error counts, in `camera_right`.
+        working_point_sigma_mm: predicted error there, root of the trace.
+        rotation_sigma_deg: predicted rotation error, root of the trace.
+        sigma_mm: 1 sigma along the principal directions, worst first.
+        directions: principal directions of (lever * dphi, displacement of the working point).
+        verdict: 0 trustworthy, 1 weak, 2 unobservable.
+        degeneracy: flags (`observability.Degeneracy`).
+        shaft_direction: mean direction of the shaft, in `camera_right`.
+    """
+
+    working_point_mm: Float[Tensor, "b 3"]
+    working_point_sigma_mm: Float[Tensor, " b"]
+    rotation_sigma_deg: Float[Tensor, " b"]
+    sigma_mm: Float[Tensor, "b 6"]
+    directions: Float[Tensor, "b 6 6"]
+    verdict: Int[Tensor, " b"]
+    degeneracy: Int[Tensor, " b"]
+    shaft_direction: Float[Tensor, "b 3"]
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Estimates for every trial of the batch.
+
+    Attributes:
+        method: `paper`, `global` or `joint`.
+        camera_right_T_arm: the estimate; translation in mm.
+        camera_left_T_camera_right: as used, refined or not; None with one camera.
+        covariance: rotation first; R = exp(dphi) R^ in `camera_right`, t = t^ + dt; rad and mm.
+        status: `SolveStatus` codes.
+        cheirality: part of the measured lines that lie in front of their camera with the tip on the imaged side.
+        iterations: accepted steps.
+        chi2_per_dof: weighted squared residuals over degrees of freedom; about 1 when the noise levels are right. NaN where unknown.
+        residual_lines, residual_ends, residual_heads: rms per camera and motion, normalised units; NaN where not measured.
+        distance: Mahalanobis distance of each motion over the root of its rows; NaN where not measured.
+        reason: `MotionReason` codes.
+        noise: levels that were used, name -> value (`image`, `ends`, `heads` as factors on the nominal ones).
+        nuisances: by name.
+        bias: correction that was subtracted from (rotation, translation); zero when none.
+        sight: what the data can see, flat over trials (observability.py); `observability(trial)` puts one trial into words.
+        history: cost of accepted iterates of the refinement.
+        information_kept: part of the information (per parameter, geometric mean) that thinning kept; 1 without.
+    """
+
+    method: str
+    camera_right_T_arm: Float[Tensor, "*batch 4 4"]
+    camera_left_T_camera_right: Float[Tensor, "*batch 4 4"] | None
+    covariance: Float[Tensor, "*batch 6 6"]
+    status: Int[Tensor, "*batch"]
+    cheirality: Float[Tensor, "*batch"]
+    iterations: Int[Tensor, "*batch"]
+    chi2_per_dof: Float[Tensor, "*batch"]
+    residual_lines: Float[Tensor, "*batch c n"]
+    residual_ends: Float[Tensor, "*batch c n"]
+    residual_heads: Float[Tensor, "*batch c n"]
+    distance: Float[Tensor, "*batch n"]
+    reason: Int[Tensor, "*batch n"]
+    noise: dict[str, Float[Tensor, "*batch"]]
+    nuisances: dict[str, Nuisance]
+    bias: Float[Tensor, "*batch 6"]
+    sight: Sight
+    history: tuple[Float[Tensor, "..."], ...] = ()
+    information_kept: float = 1.0
+
+    @property
+    def rotation_sigma_deg(self) -> Float[Tensor, "*batch"]:
+        """Root of the trace of the rotation block."""
+        return torch.rad2deg(self.covariance[..., :3, :3].diagonal(dim1=-2, dim2=-1).sum(-1).sqrt())
+
+    @property
+    def translation_sigma_mm(self) -> Float[Tensor, "*batch"]:
+        """Root of the trace of the translation block."""
+        return self.covariance[..., 3:, 3:].diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
+
+    def observability(self, trial: int = 0) -> Observability:
+        """What the data of one trial (flat index) can see, in words."""
+        from rmis_calib.solver.observability import describe
+
+        return describe(self.sight, trial)
+
+    @property
+    def verdict(self) -> Int[Tensor, "*batch"]:
+        """0 trustworthy, 1 weak, 2 unobservable; a solve that did not converge is never better than unobservable."""
+        verdict = self.sight.verdict.view_as(self.status)
+        return torch.where(self.converged, verdict, 2)
+
+    @property
+    def converged(self) -> Bool[Tensor, "*batch"]:
+        return self.status == SolveStatus.CONVERGED

@@ -1,0 +1,192 @@
+"""One call from a problem to a solution."""
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rmis_calib.errors import InsufficientDataError, ObservationsError
+from rmis_calib.geometry.rigid import rigid_from_rotation_translation
+from rmis_calib.solver.initialise import find_candidates
+from rmis_calib.solver.joint import JointFit, solve_joint
+from rmis_calib.solver.measurements import END, HEAD, LINE, Packed, pack
+from rmis_calib.solver.normal import NoiseModel
+from rmis_calib.solver.observability import Sight, look, recognise
+from rmis_calib.solver.paper import average, empirical_covariance, influence, solve_paper
+from rmis_calib.solver.problem import MIN_MOTIONS, Problem
+from rmis_calib.solver.residuals import State, residual_rows
+from rmis_calib.solver.settings import SolverSettings
+from rmis_calib.solver.solution import MotionReason, Nuisance, Solution, SolveStatus
+from rmis_calib.solver.statistics import LineStatistics
+from rmis_calib.solver.unknowns import UNITS, initial_state
+from rmis_calib.solver.variance import assumed_noise
+
+MIN_CHEIRALITY = 0.5
+
+
+def solve(problem: Problem, settings: SolverSettings | None = None, method: str | None = None) -> Solution:
+    """Estimates `camera_right_T_arm` of every trial.
+
+    Args:
+        problem: any leading trial batch.
+        settings: defaults when absent.
+        method: overrides the settings' method.
+
+    Raises:
+        ObservationsError: values that are not finite where they must be, or rotations that are not rotations.
+        InsufficientDataError: too few measured lines in some trial.
+    """
+    settings = settings or SolverSettings()
+    method = method or settings.method
+    flat = problem.flatten_batch()
+    _check(flat)
+    if method == "joint":
+        return _shaped(_joint_solution(flat, solve_joint(flat, settings), settings), problem.batch_shape)
+    statistics = LineStatistics.from_problem(flat)
+    if bool((statistics.count.sum(-1) < MIN_MOTIONS).any()):
+        raise InsufficientDataError(where="axis lines", expected=f"at least {MIN_MOTIONS}", found=int(statistics.count.sum(-1).min()))
+    if method == "paper":
+        R_each, t_each = solve_paper(statistics)
+        R, t = average(R_each, t_each)
+        shares = torch.stack([influence(flat, R_each[:, c], t_each[:, c], (c,)) for c in range(flat.n_cameras)]).mean(0)
+    else:
+        R, t, _ = find_candidates(statistics, settings.grid, settings.minima).best()
+        shares = influence(flat, R, t, tuple(range(flat.n_cameras)))
+    return _shaped(_two_step_solution(flat, R, t, empirical_covariance(shares), settings, method), problem.batch_shape)
+
+
+def _check(problem: Problem) -> None:
+    poses = problem.arm_T_rcm
+    if not bool(torch.isfinite(poses).all()):
+        raise ObservationsError(where="arm_T_rcm", expected="finite poses", found="NaN or infinity")
+    for name, R in (("arm_T_rcm", poses[..., :3, :3]), ("camera_left_T_camera_right", problem.camera_T_camera_right[..., :3, :3])):
+        gap = float((R @ R.mT - torch.eye(3, dtype=R.dtype, device=R.device)).abs().max())
+        if not gap < 1e-5 or not bool((torch.linalg.det(R) > 0).all()):
+            raise ObservationsError(where=name, expected="rotations (orthonormal, determinant +1)", found=f"a deviation of {gap:.2g}")
+
+
+def _two_step_solution(flat: Problem, R: Tensor, t: Tensor, covariance: Tensor, settings: SolverSettings, method: str) -> Solution:
+    """Solution of `paper` and `global`, which use the axis lines alone."""
+    from rmis_calib.solver.joint import cheirality
+
+    axis_only = flat.only("axis")
+    packed = pack(axis_only, settings.noise)
+    noise, _ = assumed_noise(flat, settings.noise)
+    state = initial_state(axis_only, R, t)
+    front = cheirality(packed, state, torch.ones_like(packed.line_ok[0]))
+    status = torch.where(front < MIN_CHEIRALITY, SolveStatus.BEHIND_CAMERA, SolveStatus.CONVERGED)
+    status = torch.where(torch.isfinite(covariance).all(-1).all(-1) & torch.isfinite(t).all(-1), status, SolveStatus.NON_FINITE)
+    seen = packed.line_ok.any(0).any(0)
+    nan = torch.full_like(front, torch.nan)
+    return Solution(
+        method=method,
+        camera_right_T_arm=rigid_from_rotation_translation(R, t),
+        camera_left_T_camera_right=flat.camera_T_camera_right[:, 1] if flat.n_cameras == 2 else None,
+        covariance=covariance,
+        status=status,
+        cheirality=front,
+        iterations=torch.zeros_like(status),
+        chi2_per_dof=nan,
+        distance=torch.full_like(seen, torch.nan, dtype=t.dtype),
+        reason=torch.where(seen, MotionReason.USED, MotionReason.NOT_MEASURED),
+        noise={},
+        nuisances={},
+        bias=torch.zeros_like(covariance[..., 0]),
+        sight=_sight(axis_only, R, t, covariance, noise, (False, False, False), settings),
+        **_residuals(packed, state),
+    )
+
+
+def _joint_solution(flat: Problem, fit: JointFit, settings: SolverSettings) -> Solution:
+    """Solution of the joint estimate."""
+    packed, state = fit.packed, fit.state
+    C = fit.covariance[:, :6, :6]
+    seen = (packed.rows_ok.any(0))
+    used = fit.weight > 0.5
+    measured = torch.stack([packed.rows_ok[[i for i, rc in enumerate(packed.row_camera) if rc == c]].any(0) for c in range(packed.cameras)])
+    good = (used & measured).any(0)
+    reason = torch.where(~seen, MotionReason.NOT_MEASURED, torch.where(good, MotionReason.USED, MotionReason.OUTLIER))
+    reason = torch.where(good & (measured & ~used).any(0), MotionReason.OUTLIER_ONE_CAMERA, reason)
+    kept = (used & measured).sum((0, 2)) / measured.sum((0, 2)).clamp_min(1)
+    status = torch.where((fit.cheirality < MIN_CHEIRALITY) & (fit.status == SolveStatus.CONVERGED), SolveStatus.BEHIND_CAMERA, fit.status)
+    status = torch.where((kept < 0.5) & (status == SolveStatus.CONVERGED), SolveStatus.INCONSISTENT, status)
+    rows = packed.keep(used).rows_ok.sum(0)
+    dof = (rows.sum(-1) - 6.0).clamp_min(1.0)
+    distance = torch.where(measured, fit.distance2, 0.0).sum(0) / measured.sum(0).clamp_min(1)
+    per_motion = packed.rows_ok.sum(0)
+    left = rigid_from_rotation_translation(state.stereo_R, state.stereo_t) if packed.cameras == 2 else None
+    return Solution(
+        method="joint",
+        camera_right_T_arm=rigid_from_rotation_translation(state.R, state.t),
+        camera_left_T_camera_right=left,
+        covariance=C,
+        status=status,
+        cheirality=fit.cheirality,
+        iterations=fit.steps,
+        chi2_per_dof=fit.chi2 / dof,
+        distance=torch.where(seen, (distance * measured.sum(0) / per_motion.clamp_min(1)).sqrt(), torch.nan),
+        reason=reason,
+        noise={name: getattr(fit.noise, name).sqrt() for name in ("line", "end", "head", "kinematics_mm", "kinematics_rad")},
+        nuisances=_nuisances(fit, settings),
+        bias=fit.bias[:, :6],
+        history=fit.history,
+        sight=_sight(flat, state.R, state.t, C, fit.noise, (packed.has_contours, packed.has_ends, packed.has_heads), settings),
+        **_residuals(packed, state),
+    )
+
+
+def _nuisances(fit: JointFit, settings: SolverSettings) -> dict[str, Nuisance]:
+    """Every estimated unknown beside the transform."""
+    deviation, _ = fit.layout.prior(fit.state)
+    sigma = fit.covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
+    out = {}
+    for name, part in fit.layout.blocks.items():
+        if name in ("rotation", "translation"):
+            continue
+        value = fit.state.radius[:, None] if name == "radius" else deviation[:, part]
+        held = sigma[:, part] > settings.unknowns.held_ratio * fit.layout.sigma[:, part]
+        out[name] = Nuisance(value=value, sigma=sigma[:, part], unit=UNITS[name], held=held)
+    return out
+
+
+def _sight(
+    problem: Problem, R: Tensor, t: Tensor, C: Tensor, noise: NoiseModel, uses: tuple[bool, bool, bool], settings: SolverSettings
+) -> Sight:
+    first = look(problem, R, t, C, settings.verdict, torch.zeros_like(t[:, 0], dtype=torch.int64))
+    distance = torch.linalg.vector_norm(first.working_point_mm, dim=-1)
+    flags = recognise(problem, noise.kinematics_mm.sqrt(), noise.kinematics_rad.sqrt(), uses, settings.noise, distance)
+    return replace(first, degeneracy=flags)
+
+
+def _residuals(packed: Packed, state: State) -> dict[str, Float[Tensor, "b c n"]]:
+    """Root mean square of each kind's residuals, per camera and motion."""
+    r = residual_rows(packed, state)
+    kinds, cameras = packed.row_kind, packed.row_camera
+    out = {}
+    for name, kind in (("residual_lines", LINE), ("residual_ends", END), ("residual_heads", HEAD)):
+        per_camera = []
+        for c in range(packed.cameras):
+            rows = [i for i in range(len(kinds)) if kinds[i] == kind and cameras[i] == c]
+            count = packed.rows_ok[rows].sum(0)
+            rms = (r[rows].square().sum(0) / count.clamp_min(1)).sqrt()
+            per_camera.append(torch.where(count > 0, rms, torch.nan))
+        out[name] = torch.stack(per_camera, dim=1)
+    return out
+
+
+def _shaped(solution: Solution, batch: torch.Size) -> Solution:
+    """The solution with the problem's own batch shape."""
+
+    def shaped(value: Any) -> Any:
+        if isinstance(value, Tensor):
+            return value.reshape(*batch, *value.shape[1:])
+        if isinstance(value, dict):
+            return {key: shaped(item) for key, item in value.items()}
+        if isinstance(value, Nuisance):
+            return Nuisance(shaped(value.value), shaped(value.sigma), value.unit, shaped(value.held))
+        return value
+
+    names = [name for name in vars(solution) if name not in ("sight", "history")]
+    return replace(solution, **{name: shaped(getattr(solution, name)) for name in names})

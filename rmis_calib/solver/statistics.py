@@ -1,0 +1,129 @@
+"""Sufficient statistics of the axis lines: a few small matrices, whatever the number of motions.
+
+With n the unit normal of the plane through the optical centre and the imaged axis (in `camera_right`), v the shaft's direction and p the
+RCM (both in `arm`), the axis lies in the plane when
+
+    n.R v = kron(v, n) . vec(R) = 0                       (paper, Eqs. 6 and 9)
+    n.(R p + t + o) = kron([p; 1], n) . vec([R | t + o]) = 0   (Eqs. 20 and 21; o = 0 right, R_Z^T t_Z left, Eq. 8)
+
+with column-major vec. Sums of squares of both are quadratic forms in the 9x9 and 12x12 Gram matrices of these rows. Sums over parts of the data
+add, so motions stream and partial results merge.
+
+**Direction.** From points taken RCM side first, n = X1 x X2 is a positive multiple of p x d (both in the camera's frame) for a shaft in front of
+the camera. So sum n.(p x d) / N, linear in sum n (p x v)^T and sum n v^T, is positive for the right solution and negative for one that is
+turned round; the mean of X1 tells whether the visible part is in front.
+"""
+
+from dataclasses import dataclass, fields
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rmis_calib.errors import InputError
+from rmis_calib.geometry.lines import plane_normal_from_points
+from rmis_calib.solver.problem import Problem
+
+SAMPLE = 64
+"""Motions kept as they are, for the test whether the visible part of the shaft is in front of the camera."""
+
+
+@dataclass(frozen=True)
+class LineStatistics:
+    """Sums over motions of the axis lines of each camera (`c`, right first), for a batch of trials.
+
+    Attributes:
+        rotation_gram: of kron(v, n).
+        point_gram: of kron([p; 1], n), mm^2 in the blocks of p.
+        turn: sum of n kron [p x v; v]^T, (3, 6).
+        count: motions summed.
+        offset: o of the left camera, zero for the right one, mm.
+        sample_n, sample_p, sample_v, sample_x: up to SAMPLE motions as they are; NaN rows for what was not measured.
+    """
+
+    rotation_gram: Float[Tensor, "b c 9 9"]
+    point_gram: Float[Tensor, "b c 12 12"]
+    turn: Float[Tensor, "b c 3 6"]
+    count: Float[Tensor, "b c"]
+    offset: Float[Tensor, "b c 3"]
+    sample_n: Float[Tensor, "b c s 3"]
+    sample_p: Float[Tensor, "b s 3"]
+    sample_v: Float[Tensor, "b s 3"]
+    sample_x: Float[Tensor, "b c s 3"]
+
+    def __add__(self, other: "LineStatistics") -> "LineStatistics":
+        """Statistics of both parts.
+
+        Raises:
+            InputError: the two parts come from different stereo extrinsics.
+        """
+        if not torch.equal(self.offset, other.offset):
+            raise InputError(where="LineStatistics", expected="parts with the same stereo extrinsics", found="different ones")
+        sums = {name: getattr(self, name) + getattr(other, name) for name in ("rotation_gram", "point_gram", "turn", "count")}
+        samples = {
+            f.name: torch.cat((getattr(self, f.name), getattr(other, f.name)), dim=-2)[..., :: self._stride(other), :][..., :SAMPLE, :]
+            for f in fields(self)
+            if f.name.startswith("sample_")
+        }
+        return LineStatistics(**sums, **samples, offset=self.offset)
+
+    def _stride(self, other: "LineStatistics") -> int:
+        return max(1, -(-(self.sample_p.shape[-2] + other.sample_p.shape[-2]) // SAMPLE))
+
+    def camera(self, index: int) -> "LineStatistics":
+        """Statistics of one camera alone."""
+        one = slice(index, index + 1)
+        return LineStatistics(**{f.name: getattr(self, f.name)[:, one] if f.name not in ("sample_p", "sample_v") else getattr(self, f.name) for f in fields(self)})
+
+    @classmethod
+    def from_problem(cls, problem: Problem, weight: Float[Tensor, "b c n"] | None = None) -> "LineStatistics":
+        """Sums of a problem with one trial axis; lines that were not measured do not count.
+
+        Args:
+            weight: of each line; 1 when absent.
+        """
+        n, x, ok = plane_normals(problem)
+        return cls.from_normals(n, x, ok, problem, weight)
+
+    @classmethod
+    def from_normals(cls, n: Tensor, x: Tensor, ok: Tensor, problem: Problem, weight: Tensor | None = None) -> "LineStatistics":
+        """The same from normals and rays that are already there (`plane_normals`)."""
+        w = ok.to(n.dtype) if weight is None else ok * weight
+        p, v = problem.arm_T_rcm[..., :3, 3], _arm_v(problem)
+        half = (n * w.sqrt()[..., None]).permute(0, 1, 3, 2)  # (b, c, 3, n)
+        point = torch.cat((p, torch.ones_like(p[..., :1])), dim=-1).mT  # (b, 4, n)
+        turn = torch.cat((torch.linalg.cross(p, v), v), dim=-1)
+        R_Z, t_Z = problem.camera_T_camera_right[..., :3, :3], problem.camera_T_camera_right[..., :3, 3]
+        stride = max(1, -(-problem.n_motions // SAMPLE))
+        return cls(
+            rotation_gram=_gram(v.mT, half),
+            point_gram=_gram(point, half),
+            turn=(half * w.sqrt()[:, :, None]) @ turn[:, None],
+            count=w.sum(-1),
+            offset=(R_Z.mT @ t_Z[..., None])[..., 0],
+            sample_n=torch.where(ok[..., ::stride, None], n[..., ::stride, :], torch.nan),
+            sample_p=p[:, ::stride],
+            sample_v=v[:, ::stride],
+            sample_x=x[..., ::stride, :],
+        )
+
+
+def plane_normals(problem: Problem) -> tuple[Float[Tensor, "b c n 3"], Float[Tensor, "b c n 3"], Tensor]:
+    """Unit normals and rays of the first axis point, both turned into `camera_right`, and which lines were measured."""
+    a, b = problem.axis_xy[..., 0, :], problem.axis_xy[..., 1, :]
+    ok = torch.isfinite(problem.axis_xy).all(-1).all(-1) & problem.valid
+    safe_a = torch.where(ok[..., None], a, 0.0)
+    safe_b = torch.where(ok[..., None], b, 1.0)
+    rays = torch.cat((safe_a, torch.ones_like(safe_a[..., :1])), dim=-1)
+    R = problem.camera_T_camera_right[..., :3, :3]  # rows: n R = R^T n
+    return plane_normal_from_points(safe_a, safe_b) @ R, rays @ R, ok
+
+
+def _arm_v(problem: Problem) -> Float[Tensor, "b n 3"]:
+    return (problem.arm_T_rcm[..., :3, :3] @ problem.rcm_v_axis[..., None])[..., 0]
+
+
+def _gram(left: Float[Tensor, "b i n"], right: Float[Tensor, "b c 3 n"]) -> Float[Tensor, "b c k k"]:
+    """Gram matrix of kron(left, right) over motions."""
+    rows = (left[:, None, :, None, :] * right[:, :, None]).flatten(2, 3)  # (b, c, 3 i, n)
+    return rows @ rows.mT

@@ -1,0 +1,151 @@
+"""Which parameters a joint estimate has, their priors, and their columns of the Jacobian."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rmis_calib.geometry.rotations import matrix_to_rotvec
+from rmis_calib.solver.measurements import Packed
+from rmis_calib.solver.problem import Problem
+from rmis_calib.solver.residuals import Rows, Shaft, State, rcm_axes
+from rmis_calib.solver.settings import NoiseSettings, UnknownSettings
+from rmis_calib.solver.soa import batch_last, cross, dot, rotate
+
+UNITS = {
+    "stereo_rotation": "rad",
+    "stereo_translation": "mm",
+    "radius": "mm",
+    "end_offset": "mm",
+    "rcm_offset": "mm",
+    "joint_offset": "rad or mm",
+    "clock": "s",
+}
+"""Unit of each nuisance block."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Blocks of the parameter vector, with the priors.
+
+    Attributes:
+        blocks: name -> slice; `rotation` and `translation` of the hand-eye transform come first.
+        sigma: prior 1 sigma of every parameter; infinite for the hand-eye transform.
+        origin: state that the priors are centred on.
+    """
+
+    blocks: dict[str, slice]
+    sigma: Float[Tensor, "b p"]
+    origin: State
+
+    @property
+    def size(self) -> int:
+        return self.sigma.shape[-1]
+
+    def step(self, delta: Float[Tensor, "b p"]) -> dict[str, Tensor]:
+        """A parameter vector cut into blocks."""
+        return {name: delta[:, part] for name, part in self.blocks.items()}
+
+    def take(self, index: Tensor | slice) -> "Layout":
+        return Layout(self.blocks, self.sigma[index], self.origin.take(index))
+
+    def prior(self, state: State) -> tuple[Float[Tensor, "b p"], Float[Tensor, "b p"]]:
+        """Deviation of the state from the priors' centre, and their weights 1/sigma^2."""
+        zero, origin = torch.zeros_like(state.t), self.origin
+        turned = origin.stereo_R.mT @ state.stereo_R
+        shifted = (origin.stereo_R.mT @ (state.stereo_t - origin.stereo_t)[..., None])[..., 0]
+        deviation = {
+            "rotation": zero,
+            "translation": zero,
+            "stereo_rotation": matrix_to_rotvec(turned) if "stereo_rotation" in self.blocks else zero,
+            "stereo_translation": shifted,
+            "radius": (state.radius - origin.radius)[:, None],
+            "end_offset": (state.end_offset - origin.end_offset)[:, None],
+            "rcm_offset": state.rcm_offset - origin.rcm_offset,
+            "joint_offset": state.joint_offset - origin.joint_offset,
+            "clock": (state.clock - origin.clock)[:, None],
+        }
+        return torch.cat([deviation[name] for name in self.blocks], dim=-1), self.sigma.square().reciprocal()
+
+
+def initial_state(problem: Problem, R: Float[Tensor, "b 3 3"], t: Float[Tensor, "b 3"]) -> State:
+    """The hand-eye transform with every other unknown at its nominal value."""
+    zero = t[:, 0] * 0.0
+    joints = 0 if problem.joint_derivative is None else problem.joint_derivative.shape[-1]
+    stereo = problem.camera_T_camera_right[:, -1]
+    return State(
+        R=R,
+        t=t,
+        stereo_R=stereo[:, :3, :3],
+        stereo_t=stereo[:, :3, 3],
+        radius=torch.nan_to_num(problem.radius_mm),
+        end_offset=zero,
+        rcm_offset=zero[:, None].expand(-1, 2),
+        joint_offset=zero[:, None].expand(-1, joints),
+        clock=zero,
+    )
+
+
+def make_layout(problem: Problem, packed: Packed, origin: State, settings: UnknownSettings, noise: NoiseSettings) -> Layout:
+    """The parameters that the settings ask for and the measurements can carry."""
+    b, like = origin.t.shape[0], origin.t
+    stereo_rad = torch.nan_to_num(problem.noise.stereo_rad, nan=noise.stereo_deg * torch.pi / 180.0)
+    stereo_mm = torch.nan_to_num(problem.noise.stereo_mm, nan=noise.stereo_mm)
+    infinite = torch.full_like(like[:, 0], torch.inf)
+    entries: list[tuple[str, int, Tensor]] = [("rotation", 3, infinite), ("translation", 3, infinite)]
+    if settings.stereo and packed.cameras == 2:
+        entries += [("stereo_rotation", 3, stereo_rad), ("stereo_translation", 3, stereo_mm)]
+    if settings.radius and packed.has_contours:
+        entries.append(("radius", 1, settings.radius_sigma_relative * origin.radius))
+    if settings.end_offset and packed.has_ends:
+        entries.append(("end_offset", 1, torch.full_like(infinite, settings.end_offset_sigma_mm)))
+    if settings.rcm_offset:
+        entries.append(("rcm_offset", 2, torch.full_like(infinite, settings.rcm_offset_sigma_mm)))
+    if settings.joint_offsets and packed.joint is not None and problem.joint_offset_sigma is not None:
+        entries.append(("joint_offset", packed.joint.shape[1], problem.joint_offset_sigma))
+    if settings.clock and packed.clock is not None:
+        entries.append(("clock", 1, torch.full_like(infinite, settings.clock_sigma_s)))
+    entries = [entry for entry in entries if bool((entry[2] > 0).any())]
+    blocks, sigmas, start = {}, [], 0
+    for name, width, sigma in entries:
+        blocks[name] = slice(start, start + width)
+        sigmas.append(sigma if sigma.ndim == 2 else sigma[:, None].expand(b, width))
+        start += width
+    return Layout(blocks, torch.cat(sigmas, dim=-1).clamp_min(1e-12), origin)
+
+
+def columns(layout: Layout, rows: Rows, shaft: Shaft, packed: Packed, state: State) -> Float[Tensor, "k p b n"]:
+    """Jacobian of the residuals, in the order of the layout's blocks (residuals.py derives it)."""
+    right_p = shaft.p[:, 0]
+    arm = right_p - batch_last(state.t, 1)[..., None]
+    out = torch.empty((rows.r.shape[0], layout.size, *rows.r.shape[1:]), dtype=rows.r.dtype, device=rows.r.device)
+    left = torch.tensor([c == 1 for c in packed.row_camera], device=rows.r.device)[:, None, None]
+    R = batch_last(state.R, 2)[..., None]
+
+    def put(name: str, values: Tensor) -> None:
+        out[:, layout.blocks[name]] = values
+
+    put("rotation", (cross(arm[:, None], rows.w) + rows.a).transpose(0, 1))
+    put("translation", rows.w.transpose(0, 1))
+    if "stereo_rotation" in layout.blocks:
+        put("stereo_rotation", torch.where(left, cross(right_p[:, None], rows.w) + rows.a, 0.0).transpose(0, 1))
+    if "stereo_translation" in layout.blocks:
+        put("stereo_translation", torch.where(left, rows.w, 0.0).transpose(0, 1))
+    if "radius" in layout.blocks:
+        put("radius", rows.radius[:, None])
+    if "end_offset" in layout.blocks:
+        put("end_offset", rows.end[:, None])
+    if "rcm_offset" in layout.blocks:
+        put("rcm_offset", torch.stack([dot(rows.w, rotate(R, e)[:, None]) for e in rcm_axes(packed)], dim=1))
+    if "joint_offset" in layout.blocks and packed.joint is not None:
+        put("joint_offset", torch.stack([_effect(rows, R, packed.joint[:, j]) for j in range(packed.joint.shape[1])], dim=1))
+    if "clock" in layout.blocks and packed.clock is not None:
+        put("clock", _effect(rows, R, packed.clock)[:, None])
+    return out
+
+
+def _effect(rows: Rows, R: Tensor, displacement: Float[Tensor, "6 b n"]) -> Float[Tensor, "k b n"]:
+    """Effect of a displacement (rotation, translation; in `arm`) of the shaft on every row."""
+    turn, shift = rotate(R, displacement[:3]), rotate(R, displacement[3:])
+    return dot(rows.a, turn[:, None]) + dot(rows.w, shift[:, None])
