@@ -8,10 +8,11 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "LineStatistics": ".statistics",
         "NoiseLevels": ".problem",
         "Problem": ".problem",
+        "MotionReason": ".solution",
         "Solution": ".solution",
         "SolverSettings": ".settings",
         "SolveStatus": ".solution",
         "Verdict": ".solution",
-        "solve": ".solve",
+        "solve": ".api",
     },
 )
