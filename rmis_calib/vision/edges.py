@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rmis_calib.vision.lens import Lens
+from rmis_calib.vision.runs import masked_median
 from rmis_calib.vision.sampling import inside, sample
 from rmis_calib.vision.strips import Strips
 
@@ -44,9 +45,12 @@ def place_samples(on: Bool[Tensor, "b k s"], t: Float[Tensor, " s"], count: int)
     return t[after] + (within - 0.5) * (t[1] - t[0])
 
 
-def at_stations(mask: Bool[Tensor, "b k s"], t: Float[Tensor, " s"], at: Float[Tensor, "b k p"]) -> Bool[Tensor, "b k p"]:
-    """The value of a mask at the nearest station."""
-    return mask.gather(-1, ((at - t[0]) / (t[1] - t[0])).round().long().clamp(0, t.shape[0] - 1))
+def at_stations(
+    mask: Bool[Tensor, "b k e s"], t: Float[Tensor, " s"], at: Float[Tensor, "b k p"]
+) -> Bool[Tensor, "b k e p"]:
+    """The value of masks at the nearest station."""
+    index = ((at - t[0]) / (t[1] - t[0])).round().long().clamp(0, t.shape[0] - 1)
+    return mask.gather(-1, index[:, :, None].expand(-1, -1, mask.shape[2], -1))
 
 
 def interpolate(values: Float[Tensor, "b k 2 s"], t: Float[Tensor, " s"], at: Float[Tensor, "b k p"]) -> Tensor:
@@ -97,17 +101,18 @@ def _steepest(profile: Float[Tensor, "b k 2 p d"]) -> tuple[Float[Tensor, "b k 2
 
 
 def rough(
-    image: Float[Tensor, "b 3 h w"], lens: Lens, strips: Strips, t: Tensor, lateral: Tensor, step_px: Float[Tensor, "b k 2"]
+    image: Float[Tensor, "b 3 h w"], lens: Lens, strips: Strips, t: Tensor, lateral: Tensor, use: Tensor, step_px: Float[Tensor, "b k 2"]
 ) -> EdgePoints:
     """Steepest rise within eight steps of the traced contour; its softness sets the step of `fine`."""
     offsets = torch.arange(-8, 9, device=t.device, dtype=t.dtype) * step_px[..., None]
     colours, seen = _read_bands(image, lens, strips, t, lateral, offsets)
+    seen &= use
     profile = _project(colours, seen)
     place, slope = _steepest(profile)
     height = profile[..., -4:].mean(-1) - profile[..., :4].mean(-1)
     outward = t.new_tensor([1.0, -1.0])[:, None]
-    blur = (height / slope.clamp(min=1e-4) / 2.5066).clamp(0.4, 6.0).median(-1).values * step_px
-    valid = seen & (slope > 0.25 * slope.median(-1, keepdim=True).values) & (slope > 2e-3)
+    blur = masked_median((height / slope.clamp(min=1e-4) / 2.5066).clamp(0.4, 6.0), seen) * step_px
+    valid = seen & (slope > 0.25 * masked_median(slope, seen)[..., None]) & (slope > 2e-3)
     return EdgePoints(t, lateral + outward * place * step_px[..., None], valid, height, blur)
 
 
@@ -117,17 +122,19 @@ def fine(
     strips: Strips,
     t: Float[Tensor, "b k p"],
     lateral: Float[Tensor, "b k 2 p"],
+    use: Bool[Tensor, "b k 2 p"],
     step_px: Float[Tensor, "b k 2"],
 ) -> EdgePoints:
     """Place of a blurred step in each profile, by linear least squares around `lateral`."""
     offsets = torch.arange(-6, 7, device=t.device, dtype=t.dtype)
     colours, seen = _read_bands(image, lens, strips, t, lateral, offsets * step_px[..., None])
+    seen &= use
     profile = _project(colours, seen)
     blur = _mean_blur(profile, seen, offsets)
     solve = step_estimator(offsets, blur)  # (b, k, 2, 5, d)
     fit = torch.einsum("bkend,bkepd->bkepn", solve, profile)
     height = fit[..., 1]
-    usual = height.median(-1, keepdim=True).values
+    usual = masked_median(height, seen)[..., None]
     shift = -fit[..., 2] / height.clamp(min=1e-3)
     limit = 2.5 * blur[..., None]
     valid = seen & (height > 0.3 * usual) & (height > 5e-3) & (shift.abs() < limit)

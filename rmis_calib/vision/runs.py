@@ -14,9 +14,13 @@ def run_lengths(on: Bool[Tensor, "*b s"]) -> Float[Tensor, "*b s"]:
     return counts.gather(-1, label) * on
 
 
-def longest_run(on: Bool[Tensor, "*b s"]) -> Bool[Tensor, "*b s"]:
-    """The longest unbroken run (all of them where several are equally long)."""
-    lengths = run_lengths(on)
+def longest_run(on: Bool[Tensor, "*b s"], gap: Float[Tensor, "*b"]) -> Bool[Tensor, "*b s"]:
+    """The longest run, with gaps of up to `gap` stations bridged (all of them where several are equally long)."""
+    bridged = on | (~on & (run_lengths(~on) <= gap[..., None]))
+    label = _run_labels(bridged)
+    counts = torch.zeros(*on.shape[:-1], on.shape[-1] + 1, device=on.device)
+    counts.scatter_add_(-1, label, on.float())
+    lengths = counts.gather(-1, label) * on
     return on & (lengths == lengths.amax(-1, keepdim=True))
 
 
@@ -28,6 +32,12 @@ def run_minimum(value: Float[Tensor, "*b s"], on: Bool[Tensor, "*b s"]) -> Float
     lowest = torch.full((*on.shape[:-1], on.shape[-1] + 1), torch.inf, device=on.device)
     lowest.scatter_reduce_(-1, label, steady, "amin")
     return torch.where(on, lowest.gather(-1, label), torch.inf)
+
+
+def run_range(value: Float[Tensor, "*b s"]) -> Float[Tensor, "*b s"]:
+    """Largest minus smallest value over each station and its two neighbours."""
+    windows = pad(value, (1, 1), mode="replicate").unfold(-1, 3, 1)
+    return windows.amax(-1) - windows.amin(-1)
 
 
 def _run_labels(on: Bool[Tensor, "*b s"]) -> Tensor:

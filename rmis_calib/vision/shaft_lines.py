@@ -1,5 +1,6 @@
 """The shaft detector: pictures in, contour lines, axis and shaft end out, with uncertainty and a reason per frame."""
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -12,14 +13,13 @@ from rmis_calib.vision import edges, ends
 from rmis_calib.vision.lens import Lens
 from rmis_calib.vision.linefit import LineFit, fit_lines
 from rmis_calib.vision.reasons import FrameReason
-from rmis_calib.vision.runs import smooth_over
+from rmis_calib.vision.runs import masked_median, smooth_over
 from rmis_calib.vision.search import Stages, search
 from rmis_calib.vision.settings import DetectorSettings
 from rmis_calib.vision.strips import Strips
 from rmis_calib.vision.trace import Trace
 
 _POLYLINE = 24
-DEBUG=False
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,9 +113,11 @@ class ShaftDetector:
         points, fit = self._contours(pixels, trace)
         strips = replace(trace.strips, offset=fit.offset, slope=fit.slope)
         end = ends.locate(pixels, self.lens, strips, trace.end, trace.width, self.settings.sigma_floor_px * 5)
-        share = (points.valid.to(fit.inliers.dtype).mean(-1) * fit.inliers / self.settings.edge_samples).amin(-1)
-        confidence = _confidence(trace, fit, share)
-        clear = (share > 0.15) & (scores > 0) & (fit.spread_t.amin(-1) > 0)
+        offered = edges.at_stations(trace.sides, trace.t, edges.place_samples(trace.on, trace.t, self.settings.edge_samples))
+        share = (fit.inliers / offered.sum(-1).clamp(min=1)).amin(-1)
+        confidence = _confidence(trace, fit, share, math.hypot(*pixels.shape[-2:]))
+        cylinder = (fit.slope[..., 0] - fit.slope[..., 1]).abs() < math.tan(math.radians(self.settings.max_convergence_deg))
+        clear = cylinder & (share > 0.15) & (scores > 0) & (fit.spread_t.amin(-1) > 0)
         valid = clear & (confidence >= self.settings.min_confidence) & ~broken[:, None]
         order = torch.where(valid, confidence, -1.0).sort(dim=1, descending=True, stable=True).indices
         reason = _reason(stages, scores, clear, valid, broken)
@@ -128,15 +130,16 @@ class ShaftDetector:
         t = edges.place_samples(trace.on, trace.t, settings.edge_samples)
         lateral = edges.interpolate(trace.lateral, trace.t, t)
         step = torch.full_like(strips.offset, max(1.0, pixels.shape[-1] / settings.small_width_px / 3))
-        points = edges.rough(pixels, lens, strips, t, lateral, step)
-        both = t[:, :, None].expand_as(points.lateral)
-        main = edges.at_stations(trace.main, trace.t, t)[:, :, None].expand_as(both)
+        both = t[:, :, None].expand_as(lateral)
+        use = edges.at_stations(trace.sides, trace.t, t)
+        points = edges.rough(pixels, lens, strips, t, lateral, use, step)
+        main = edges.at_stations(trace.main[:, :, None], trace.t, t).expand_as(both)
         line = fit_lines(both, points.lateral, points.valid.to(t.dtype), main, settings.sigma_floor_px)
         straight = line.offset[..., None] + line.slope[..., None] * both
         near = points.valid & ((points.lateral - straight).abs() < 4 * line.scatter_px[..., None])
         centre = straight + smooth_over(points.lateral - straight, near)
-        points = edges.fine(pixels, lens, strips, t, centre, (points.blur_px / 1.3).clamp(1.0, 4.0))
-        usual = points.height.median(-1, keepdim=True).values.clamp(min=1e-6)
+        points = edges.fine(pixels, lens, strips, t, centre, use, (points.blur_px / 1.3).clamp(1.0, 4.0))
+        usual = masked_median(points.height, points.valid)[..., None].clamp(min=1e-6)
         weight = points.valid * (points.height / usual).clamp(0.3, 1.5)
         return points, fit_lines(both, points.lateral, weight, main, settings.sigma_floor_px)
 
@@ -213,14 +216,15 @@ def _axis(
     return axis, on_axis[..., :2] / on_axis[..., 2:]
 
 
-def _confidence(trace: Trace, fit: LineFit, share: Float[Tensor, "b k"]) -> Float[Tensor, "b k"]:
+def _confidence(trace: Trace, fit: LineFit, share: Float[Tensor, "b k"], reach_px: float) -> Float[Tensor, "b k"]:
     """Product of saturating marks for contrast, length, agreement of the edge points, and reaching the border."""
     contrast = trace.contrast / (trace.contrast + 0.08)
     length = 1 - torch.exp(-1.2 * trace.length / trace.width.clamp(min=1.0))
     agreement = 1 / (1 + (fit.scatter_px.amax(-1) / (0.5 + 0.06 * trace.width)).square())
     border = torch.where(trace.start_at_border, 1.0, 0.45)
-    if DEBUG: print(contrast,length,agreement,border,share,trace.length,trace.width,fit.inliers,fit.scatter_px)
-    return contrast * length * agreement * border * (share / 0.6).clamp(max=1.0)
+    # A short dark bar at the border may be anything; a long one is rarely furniture.
+    size = 1 - torch.exp(-trace.length / (0.12 * reach_px))
+    return contrast * length * agreement * border * size * (share / 0.6).clamp(max=1.0)
 
 
 def _reason(stages: Stages, scores: Tensor, clear: Tensor, valid: Tensor, broken: Tensor) -> Int[Tensor, " b"]:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rmis_calib.vision.linefit import fit_lines
-from rmis_calib.vision.runs import first_on, last_on, longest_run, masked_median, masked_quantile, run_lengths, run_minimum, smooth_over
+from rmis_calib.vision.runs import first_on, last_on, longest_run, masked_median, masked_quantile, run_lengths, run_minimum, run_range, smooth_over
 from rmis_calib.vision.settings import DetectorSettings
 from rmis_calib.vision.strips import SmallPicture, Strips
 
@@ -20,8 +20,10 @@ _OFFSETS = 9
 # Where between shaft (0) and surroundings (1) the inside may lie. Wrists of bare metal lie at 0.5 to 0.7, shaded shafts
 # below 0.35, a stretch of shaft lit differently beyond an interruption at up to 0.6 (frames of both real sets).
 _TONE_SHARE = 0.38
-_RUN_SHARE = 0.75
-_CONTRAST_SHARE = 0.67
+_RUN_SHARE = 0.6
+_CONTRAST_SHARE = 0.8
+# Largest change of tone over three stations of a plain shaft; screws and jaws of a wrist change by 0.3 and more.
+_RUN_UNEVENNESS = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +37,8 @@ class Trace:
     """The longest unbroken stretch of `on`."""
     on: Bool[Tensor, "b k s"]
     """At least one contour is seen, no seen one is missing, and the inside has the shaft's own tone."""
+    sides: Bool[Tensor, "b k 2 s"]
+    """`on`, and this contour is in the field of view."""
     lateral: Float[Tensor, "b k 2 s"]
     """Lateral place of [left, right] contour, px, smooth along the shaft."""
     start: Float[Tensor, "b k"]
@@ -111,13 +115,14 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
     # is enough that the inside has the shaft's tone and both sides, most of a width away, do not.
     far = torch.where(inner_seen[..., 7:], value[..., 7:], inf).amin(-1)
     band = centre_seen & torch.isfinite(far) & (inner < far - settings.min_contrast) & strips.valid[..., None]
+    band &= run_range(inner) < _RUN_UNEVENNESS
     band = on | (band & _own_tone(inner, far, band, on))
     long_runs = band & (run_lengths(band) * spacing > settings.end_run_widths * width[..., None] - spacing)
     carries_end = torch.where(long_runs.any(-1, keepdim=True), long_runs, on)
     contrast = masked_median(torch.where(torch.isfinite(step), step, 0.0), on)
     length = on.float().sum(-1) * spacing
     whole = Trace(
-        strips, t, longest_run(on), on, line + wander, first_on(t, on), last_on(t, carries_end), *_borders(t, on, centre_seen, width),
+        strips, t, longest_run(on, 0.7 * width / spacing), on, on[:, :, None] & sides.seen, line + wander, first_on(t, on), last_on(t, carries_end), *_borders(t, on, centre_seen, width),
         width, length, contrast, surround,
     )  # fmt: skip
     return _towards_tip(whole, first_on(t, carries_end), last_on(t, on), t, centre_seen)
@@ -126,7 +131,7 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
 def straighten(traced: Trace) -> Strips:
     """The strips with straight lines through their traced contours."""
     t = traced.t.expand_as(traced.lateral)
-    weight = traced.on[:, :, None].expand_as(traced.lateral).to(t.dtype)
+    weight = traced.sides.to(t.dtype)
     main = traced.main[:, :, None].expand_as(traced.lateral)
     line = fit_lines(t, traced.lateral, weight, main, 0.1 * float(traced.t[1] - traced.t[0]))
     sane = (line.inliers > 5) & (line.slope.abs() < 0.2)
@@ -183,6 +188,7 @@ def _towards_tip(
         t=t,
         main=torch.where(turn, low_to_high.main.flip(-1), low_to_high.main),
         on=torch.where(turn, low_to_high.on.flip(-1), low_to_high.on),
+        sides=torch.where(turn[..., None], low_to_high.sides.flip(2).flip(3), low_to_high.sides),
         lateral=lateral,
         start=torch.where(flip, -high_start, low_to_high.start),
         end=torch.where(flip, -low_end, low_to_high.end),
