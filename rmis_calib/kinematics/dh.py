@@ -72,8 +72,7 @@ def build_chain(
 
     A chain's joint turns about, or slides along, the z axis of its fixed offset. A row of a modified table is that
     offset itself, since Rz(q) and Tz(q) commute with its last two factors. In a standard table Tx(a) Rx(alpha) comes
-    after the
-    joint: it is a fixed frame of its own there.
+    after the joint: it is a fixed frame of its own there.
 
     Args:
         joints: rows from the base to the end.
@@ -85,14 +84,13 @@ def build_chain(
     """
     if not joints:
         raise RobotError(where="joints", expected="at least one joint", found="none")
-    where = str(device)
 
     def fixed(alpha: float, a: float, theta: float, d: float) -> Transform3d:
         # In float64 until the end, so that a chain in single precision is the rounded one.
         row = torch.tensor([alpha, a, theta, d], dtype=torch.float64)
-        return Transform3d(matrix=dh_matrix(row[0], row[1], row[2], row[3], convention).to(dtype=dtype, device=where))
+        return Transform3d(matrix=dh_matrix(row[0], row[1], row[2], row[3], convention).to(dtype))
 
-    root = end = Frame("frame_0", link=Link("frame_0"), joint=Joint(dtype=dtype, device=where))
+    root = end = Frame("frame_0", link=Link("frame_0"), joint=Joint(dtype=dtype))
     for number, row in enumerate(joints, start=1):
         if row.type not in ("revolute", "prismatic"):
             expected = "type revolute or prismatic"
@@ -100,12 +98,13 @@ def build_chain(
         modified = convention == "modified"
         before = (row.alpha_rad, row.a_mm) if modified else (0.0, 0.0)
         offset = fixed(*before, row.theta_rad, row.d_mm)
-        joint = Joint(f"{number}.{row.name}", offset, row.type, dtype=dtype, device=where)
+        joint = Joint(f"{number}.{row.name}", offset, row.type, dtype=dtype)
         end = _append(end, f"frame_{number}" if modified else f"joint_{number}", joint)
         if not modified:
             after = fixed(row.alpha_rad, row.a_mm, 0.0, 0.0)
-            end = _append(end, f"frame_{number}", Joint(f"{number}.link", after, "fixed", dtype=dtype, device=where))
-    return Chain(root, dtype=dtype, device=where)
+            end = _append(end, f"frame_{number}", Joint(f"{number}.link", after, "fixed", dtype=dtype))
+    # Moved at the end: a chain that is made on another device keeps some of its index tensors on the CPU.
+    return Chain(root, dtype=dtype).to(device=device)
 
 
 def frame_poses(chain: Chain, joints: Float[Tensor, "*batch j"]) -> Float[Tensor, "*batch frames 4 4"]:

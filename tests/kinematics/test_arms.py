@@ -116,6 +116,17 @@ def test_any_batch_and_precision(batch: tuple[int, ...], dtype: torch.dtype) -> 
     assert {value.dtype for value in vars(pose).values()} == {dtype}
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_same_answers_on_a_gpu() -> None:
+    robot = load_robot("dvrk-classic")
+    joints = torch.randn(5, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    here = RobotKinematics(robot, "laparoscope", "instrument")
+    there = RobotKinematics(robot, "laparoscope", "instrument", device="cuda")
+    for name, value in vars(there.instrument(joints.cuda())).items():
+        torch.testing.assert_close(value.cpu(), getattr(here.instrument(joints), name))
+    torch.testing.assert_close(there.base_T_arm(joints[:, :4].cuda()).cpu(), here.base_T_arm(joints[:, :4]))
+
+
 def test_gradients_flow_to_joint_offsets() -> None:
     kinematics = RobotKinematics(load_robot("dvrk-classic"), "laparoscope", "instrument")
     readings = torch.randn(3, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)

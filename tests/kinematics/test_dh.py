@@ -112,6 +112,14 @@ def test_single_precision_is_the_rounded_chain() -> None:
     assert np.abs(poses.numpy() - exact).max() < 1e-5  # 60 mm in float32: 4e-6 a rounding
 
 
+@pytest.mark.parametrize("convention", ["modified", "standard"])
+def test_everything_moves_to_the_device(convention: str) -> None:
+    # "meta" refuses to meet CPU tensors as a GPU would, and is present everywhere.
+    chain = build_chain(TABLE, convention, torch.float64, "meta")
+    poses = frame_poses(chain, torch.zeros(2, 4, dtype=torch.float64, device="meta"))
+    assert poses.device.type == "meta" and poses.shape == (2, 5, 4, 4)
+
+
 def test_precision_is_never_mixed_silently() -> None:
     chain = build_chain(TABLE, "modified", torch.float64)
     with pytest.raises(ShapeError, match=r"expected \(..., 4\) of torch.float64, found \(4,\) of torch.float32"):
