@@ -101,7 +101,13 @@ def _steepest(profile: Float[Tensor, "b k 2 p d"]) -> tuple[Float[Tensor, "b k 2
 
 
 def rough(
-    image: Float[Tensor, "b 3 h w"], lens: Lens, strips: Strips, t: Tensor, lateral: Tensor, use: Tensor, step_px: Float[Tensor, "b k 2"]
+    image: Float[Tensor, "b 3 h w"],
+    lens: Lens,
+    strips: Strips,
+    t: Tensor,
+    lateral: Tensor,
+    use: Tensor,
+    step_px: Float[Tensor, "b k 2"],
 ) -> EdgePoints:
     """Steepest rise within eight steps of the traced contour; its softness sets the step of `fine`."""
     offsets = torch.arange(-8, 9, device=t.device, dtype=t.dtype) * step_px[..., None]
@@ -178,4 +184,6 @@ def _mean_blur(
     shift = (0.5 * (before - after) / (before + after - 2 * here).clamp(min=1e-12)).clamp(-1.0, 1.0)
     log_bank = bank.log()
     low = log_bank[best[..., 0]]
-    return (low + shift * torch.where(shift > 0, log_bank[best[..., 0] + 1] - low, low - log_bank[best[..., 0] - 1])).exp()
+    return (
+        low + shift * torch.where(shift > 0, log_bank[best[..., 0] + 1] - low, low - log_bank[best[..., 0] - 1])
+    ).exp()

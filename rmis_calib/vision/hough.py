@@ -102,7 +102,7 @@ def peaks(votes: Float[Tensor, "b angles rhos"], count: int) -> HoughLines:
     smooth = avg_pool2d(pad(around[:, None], (1, 1, 0, 0)), 3, stride=1)[:, 0, 2:-2]
     wide = torch.cat([smooth[:, -3:], smooth, smooth[:, :3]], 1)
     highest = max_pool2d(pad(wide[:, None], (2, 2, 0, 0)), (7, 5), stride=1)[:, 0]
-    score = torch.where(smooth[:, : angles] >= highest[:, : angles], smooth[:, : angles], 0.0)
+    score = torch.where(smooth[:, :angles] >= highest[:, :angles], smooth[:, :angles], 0.0)
     best = score.reshape(frames, -1).topk(count, dim=1)
     angle, rho = best.indices // rhos, best.indices % rhos
     flat = smooth.reshape(frames, -1)

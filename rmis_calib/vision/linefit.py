@@ -63,7 +63,9 @@ def fit_lines(
     independent = scatter * (2.0 / inliers.clamp(min=3.0)).sqrt()
     together = _block_sigma(residual, robust, (t - centre[..., None]) / spread[..., None].clamp(min=1e-6))
     sigma = torch.maximum(independent, together)
-    return LineFit(offset, slope, centre, spread, scatter, sigma, (robust > 0.1 * weight.clamp(min=1e-9)).sum(-1).to(t.dtype))
+    return LineFit(
+        offset, slope, centre, spread, scatter, sigma, (robust > 0.1 * weight.clamp(min=1e-9)).sum(-1).to(t.dtype)
+    )
 
 
 def _solve(t: Tensor, y: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -14,10 +14,22 @@ def run_lengths(on: Bool[Tensor, "*b s"]) -> Float[Tensor, "*b s"]:
     return counts.gather(-1, label) * on
 
 
+def bridge(on: Bool[Tensor, "*b s"], gap: Float[Tensor, "*b"]) -> Bool[Tensor, "*b s"]:
+    """The mask with its gaps of up to `gap` stations filled."""
+    return on | (run_lengths(~on) <= gap[..., None])
+
+
+def run_any(runs: Bool[Tensor, "*b s"], mark: Bool[Tensor, "*b s"]) -> Bool[Tensor, "*b s"]:
+    """Stations of those runs that hold a marked station."""
+    label = _run_labels(runs)
+    marked = torch.zeros(*runs.shape[:-1], runs.shape[-1] + 1, device=runs.device)
+    marked.scatter_reduce_(-1, label, (mark & runs).float(), "amax")
+    return runs & (marked.gather(-1, label) > 0)
+
+
 def longest_run(on: Bool[Tensor, "*b s"], gap: Float[Tensor, "*b"]) -> Bool[Tensor, "*b s"]:
     """The longest run, with gaps of up to `gap` stations bridged (all of them where several are equally long)."""
-    bridged = on | (~on & (run_lengths(~on) <= gap[..., None]))
-    label = _run_labels(bridged)
+    label = _run_labels(bridge(on, gap))
     counts = torch.zeros(*on.shape[:-1], on.shape[-1] + 1, device=on.device)
     counts.scatter_add_(-1, label, on.float())
     lengths = counts.gather(-1, label) * on

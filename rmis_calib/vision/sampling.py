@@ -18,7 +18,9 @@ def sample(images: Float[Tensor, "b c h w"], uv: Float[Tensor, "b *points 2"]) -
     return values[:, :, 0].mT.reshape(*uv.shape[:-1], images.shape[1])
 
 
-def inside(uv: Float[Tensor, "*points 2"], image_size: tuple[int, int], margin_px: float = 0.0) -> Bool[Tensor, "*points"]:
+def inside(
+    uv: Float[Tensor, "*points 2"], image_size: tuple[int, int], margin_px: float = 0.0
+) -> Bool[Tensor, "*points"]:
     """Whether points lie in the picture, at least `margin_px` from the centres of its outermost pixels."""
     height, width = image_size
     u, v = uv.unbind(-1)

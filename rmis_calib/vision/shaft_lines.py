@@ -113,10 +113,14 @@ class ShaftDetector:
         points, fit = self._contours(pixels, trace)
         strips = replace(trace.strips, offset=fit.offset, slope=fit.slope)
         end = ends.locate(pixels, self.lens, strips, trace.end, trace.width, self.settings.sigma_floor_px * 5)
-        offered = edges.at_stations(trace.sides, trace.t, edges.place_samples(trace.on, trace.t, self.settings.edge_samples))
+        offered = edges.at_stations(
+            trace.sides, trace.t, edges.place_samples(trace.on, trace.t, self.settings.edge_samples)
+        )
         share = (fit.inliers / offered.sum(-1).clamp(min=1)).amin(-1)
         confidence = _confidence(trace, fit, share, math.hypot(*pixels.shape[-2:]))
-        cylinder = (fit.slope[..., 0] - fit.slope[..., 1]).abs() < math.tan(math.radians(self.settings.max_convergence_deg))
+        cylinder = (fit.slope[..., 0] - fit.slope[..., 1]).abs() < math.tan(
+            math.radians(self.settings.max_convergence_deg)
+        )
         clear = cylinder & (share > 0.15) & (scores > 0) & (fit.spread_t.amin(-1) > 0)
         valid = clear & (confidence >= self.settings.min_confidence) & ~broken[:, None]
         order = torch.where(valid, confidence, -1.0).sort(dim=1, descending=True, stable=True).indices

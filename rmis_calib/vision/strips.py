@@ -68,7 +68,11 @@ class Strips:
     def points(self, t: Float[Tensor, "b k *s"], y: Float[Tensor, "b k *s"]) -> Float[Tensor, "b k *s 2"]:
         """Ideal pixels of (station, lateral) pairs."""
         shape = (*t.shape[:2], *[1] * (t.ndim - 2), 2)
-        return self.origin.reshape(shape) + t[..., None] * self.along.reshape(shape) + y[..., None] * self.left.reshape(shape)
+        return (
+            self.origin.reshape(shape)
+            + t[..., None] * self.along.reshape(shape)
+            + y[..., None] * self.left.reshape(shape)
+        )
 
     def pick(self, index: Tensor) -> "Strips":
         """The strips with these indices, (b, k') int64."""
@@ -99,7 +103,9 @@ def snap(picture: SmallPicture, lines: HoughLines) -> HoughLines:
     centre = t.new_tensor(picture.centre)
     tangent = torch.stack([-lines.normal[..., 1], lines.normal[..., 0]], -1)
     across = lines.rho[..., None, None] + deltas  # (b, p, 1, 9)
-    points = centre + across[..., None] * lines.normal[:, :, None, None] + (t[:, None, None] * tangent[:, :, None, None])
+    points = (
+        centre + across[..., None] * lines.normal[:, :, None, None] + (t[:, None, None] * tangent[:, :, None, None])
+    )
     value, seen = picture.read(points)
     rise = ((value[..., 2:] - value[..., :-2]) * (seen[..., 2:] & seen[..., :-2])).clamp(0.0, 0.5)
     place = deltas[1:-1].expand_as(rise)

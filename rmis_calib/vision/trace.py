@@ -11,7 +11,19 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rmis_calib.vision.linefit import fit_lines
-from rmis_calib.vision.runs import first_on, last_on, longest_run, masked_median, masked_quantile, run_lengths, run_minimum, run_range, smooth_over
+from rmis_calib.vision.runs import (
+    bridge,
+    first_on,
+    last_on,
+    longest_run,
+    masked_median,
+    masked_quantile,
+    run_any,
+    run_lengths,
+    run_minimum,
+    run_range,
+    smooth_over,
+)
 from rmis_calib.vision.settings import DetectorSettings
 from rmis_calib.vision.strips import SmallPicture, Strips
 
@@ -113,18 +125,33 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
     on &= run_lengths(on) * spacing > (0.4 * width).clamp(min=2.5 * spacing)[..., None]
     # The end may lie on a stretch whose contours do not continue these lines (a sleeve, a lens that bends them): there it
     # is enough that the inside has the shaft's tone and both sides, most of a width away, do not.
+    # Only beyond an interruption, such as a ball: a wrist follows the shaft at once and is darker than tissue as well.
     far = torch.where(inner_seen[..., 7:], value[..., 7:], inf).amin(-1)
-    band = centre_seen & torch.isfinite(far) & (inner < far - settings.min_contrast) & strips.valid[..., None]
-    band &= run_range(inner) < _RUN_UNEVENNESS
-    band = on | (band & _own_tone(inner, far, band, on))
+    darker = centre_seen & torch.isfinite(far) & (inner < far - settings.min_contrast) & strips.valid[..., None]
+    main = longest_run(on, 0.7 * width / spacing)
+    beyond = darker & ~run_any(bridge(darker | on, 0.3 * width / spacing), main)
+    band = on | (beyond & (run_range(inner) < _RUN_UNEVENNESS) & _own_tone(inner, far, beyond, on))
     long_runs = band & (run_lengths(band) * spacing > settings.end_run_widths * width[..., None] - spacing)
     carries_end = torch.where(long_runs.any(-1, keepdim=True), long_runs, on)
     contrast = masked_median(torch.where(torch.isfinite(step), step, 0.0), on)
     length = on.float().sum(-1) * spacing
+    start_at_border, end_at_border = _borders(t, on, centre_seen, width)
     whole = Trace(
-        strips, t, longest_run(on, 0.7 * width / spacing), on, on[:, :, None] & sides.seen, line + wander, first_on(t, on), last_on(t, carries_end), *_borders(t, on, centre_seen, width),
-        width, length, contrast, surround,
-    )  # fmt: skip
+        strips=strips,
+        t=t,
+        main=main,
+        on=on,
+        sides=on[:, :, None] & sides.seen,
+        lateral=line + wander,
+        start=first_on(t, on),
+        end=last_on(t, carries_end),
+        start_at_border=start_at_border,
+        end_at_border=end_at_border,
+        width=width,
+        length=length,
+        contrast=contrast,
+        surround=surround,
+    )
     return _towards_tip(whole, first_on(t, carries_end), last_on(t, on), t, centre_seen)
 
 
