@@ -34,8 +34,8 @@ _OFFSETS = 9
 _TONE_SHARE = 0.38
 _RUN_SHARE = 0.6
 _CONTRAST_SHARE = 0.8
-# Largest change of tone over three stations of a plain shaft; screws and jaws of a wrist change by 0.3 and more.
-_RUN_UNEVENNESS = 0.25
+# Largest change of tone over three stations of a plain shaft; its screws and jaws change by more.
+_RUN_UNEVENNESS = 0.45
 
 
 @dataclass(frozen=True, eq=False)
