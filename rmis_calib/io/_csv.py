@@ -33,8 +33,12 @@ class Table:
         return place if column is None else f"{place}, column {column}"
 
 
-def read_table(path: str | Path) -> Table:
+def read_table(path: str | Path, may_be_empty: bool = False) -> Table:
     """A comma-separated table with one header line. A byte-order mark and CR LF line ends are accepted.
+
+    Args:
+        path: the file.
+        may_be_empty: accept a header without rows.
 
     Raises:
         FileError: the file is absent or unreadable.
@@ -44,6 +48,8 @@ def read_table(path: str | Path) -> Table:
     data = read_bytes(path).removeprefix(_BOM).rstrip()
     header, _, body = data.partition(b"\n")
     columns = _parse_header(path, header)
+    if not body and may_be_empty:
+        return Table(path, columns, np.empty((0, len(columns))))
     if not body:
         raise RecordingError(where=str(path), expected="a header line and rows of numbers", found="no rows")
     rows = body.count(b"\n") + 1

@@ -57,6 +57,15 @@ def canonical(given: Arrays) -> Arrays:
     return arrays | scalars
 
 
+def plain(name: str, value: Any) -> Any:
+    """An array, or a number for a key that is one.
+
+    Raises:
+        ObservationsError: ragged lists, or not one number for a key that is one.
+    """
+    return _scalar(name, value) if name in _SCALARS else _as_array(name, value)
+
+
 def _motions(given: Arrays) -> int:
     shape = np.shape(given["arm_T_rcm"])
     if len(shape) != 3 or shape[0] < 1:
@@ -84,16 +93,20 @@ def _need(given: Arrays, name: str, other: str) -> None:
         raise ObservationsError(where=name, expected=f"{other} beside it", found="none")
 
 
+def _as_array(name: str, value: Any) -> np.ndarray:
+    try:
+        return np.asarray(value)
+    except ValueError as error:
+        raise ObservationsError(where=name, expected="an array of numbers", found="ragged nested lists") from error
+
+
 def _numbers(name: str, value: Any) -> np.ndarray:
     """A float64 copy.
 
     Raises:
         ObservationsError: not real numbers, or infinity.
     """
-    try:
-        array = np.asarray(value)
-    except ValueError as error:
-        raise ObservationsError(where=name, expected="an array of numbers", found="ragged nested lists") from error
+    array = _as_array(name, value)
     if array.dtype.kind not in "fiu":
         raise ObservationsError(where=name, expected="real numbers", found=f"dtype {array.dtype}")
     array = array.astype(np.float64)

@@ -13,6 +13,7 @@ import numpy as np
 from av.video.frame import VideoFrame
 
 from rmis_calib.errors import VideoError
+from rmis_calib.io._containers import is_cut_short
 
 
 @dataclass(frozen=True)
@@ -32,8 +33,8 @@ class VideoReader:
     """Frames of a video file in the order of their display.
 
     Opening reads every packet without decoding it: an exact count, an exact time of each frame, and the news of a file
-    that was cut off. A cut that leaves whole packets in a format without an index or a duration (MPEG-TS, raw H.264)
-    shows only against frame_times.csv.
+    that was cut off. A cut that leaves whole packets in a format that states neither its length nor its count (MPEG-TS,
+    raw H.264) shows only against frame_times.csv.
 
     Raises:
         VideoError: the file is empty, not a video, or truncated.
@@ -175,8 +176,8 @@ class VideoReader:
 
 def _read_index(container: Any, stream: Any) -> _Index:
     pts, key_pts = [], []
-    end = count = present = 0
-    is_damaged = False
+    count = present = 0
+    is_damaged = is_cut_short(Path(container.name))
     for packet in container.demux(stream):
         if not packet.size:  # the flush at the end
             continue
@@ -187,26 +188,9 @@ def _read_index(container: Any, stream: Any) -> _Index:
         count += 1
         if packet.pts is not None:
             pts.append(packet.pts)
-            end = max(end, packet.pts + (packet.duration or 0))
             if packet.is_keyframe:
                 key_pts.append(packet.pts)
-    promised = _promised_count(stream, present, float(end * stream.time_base)) if pts else stream.frames
-    return _Index(count, sorted(pts), sorted(key_pts), promised, present, is_damaged)
-
-
-def _promised_count(stream: Any, present: int, end_s: float) -> int:
-    """Number of packets that the container claims to hold; 0 where it claims nothing."""
-    declared = stream.metadata.get("NUMBER_OF_FRAMES", "")
-    if stream.frames or declared.isdigit():
-        return stream.frames or int(declared)
-    # Matroska states a duration, "HH:MM:SS.fraction", and no count.
-    parts = stream.metadata.get("DURATION", "").split(":")
-    if len(parts) != 3 or not stream.average_rate:
-        return 0
-    hours, minutes, seconds = (float(part) for part in parts)
-    missing = round((hours * 3600 + minutes * 60 + seconds - end_s) * float(stream.average_rate))
-    # The duration is rounded, and may or may not count the time that the last frame is shown.
-    return present + missing if missing >= 2 else 0
+    return _Index(count, sorted(pts), sorted(key_pts), stream.frames, present, is_damaged)
 
 
 def _has_hidden_packets(container: Any, stream: Any) -> bool:

@@ -110,7 +110,7 @@ class ShaftObservations:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Any]) -> "ShaftObservations":
-        """Observations from arrays by the keys of the file.
+        """Observations from arrays, or nested lists, by the keys of the file.
 
         Raises:
             ObservationsError: a key is unknown or missing, or an array is wrong.
@@ -123,7 +123,7 @@ class ShaftObservations:
         if missing:
             expected = f"keys {', '.join(checks.REQUIRED)}"
             raise ObservationsError(where="observations", expected=expected, found=f"no {', '.join(missing)}")
-        return cls(**arrays)
+        return cls(**{name: checks.plain(name, value) for name, value in arrays.items()})
 
     @classmethod
     def load(cls, path: str | Path) -> "ShaftObservations":

@@ -42,8 +42,8 @@ def read_frame_times(path: str | Path) -> np.ndarray:
     return require_increasing(table, "timestamp_s")
 
 
-def read_head_points(path: str | Path, n_frames: int, image_size: tuple[int, int], stereo: bool) -> HeadPoints:
-    """Head points of a recording.
+def read_head_points(path: str | Path, n_frames: int, image_size: tuple[int, int], stereo: bool) -> HeadPoints | None:
+    """Head points of a recording; None for a file that labels no frame.
 
     Args:
         path: head_points.csv.
@@ -56,9 +56,11 @@ def read_head_points(path: str | Path, n_frames: int, image_size: tuple[int, int
         RecordingError: an unknown or missing column, a frame that does not exist or does not increase, or a position
             that is not finite or further from the image than its own size.
     """
-    table = read_table(path)
+    table = read_table(path, may_be_empty=True)
     has_left = stereo and any(column in _LEFT for column in table.columns)
     require_columns(table, ("frame", *_RIGHT, *(_LEFT if has_left else ())))
+    if not len(table.values):
+        return None
     frames = require_increasing(table, "frame")
     bad = (frames != np.round(frames)) | (frames < 0) | (frames >= n_frames)
     if bad.any():

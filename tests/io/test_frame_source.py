@@ -127,7 +127,7 @@ def test_errors_reach_the_consumer_in_their_place(tmp_path: Path) -> None:
         ("v.webm", "libvpx", {}),
     ],
 )
-@pytest.mark.parametrize("fraction", [0.9, 0.6, 0.01])
+@pytest.mark.parametrize("fraction", [0.95, 0.9, 0.75, 0.6, 0.3, 0.01])
 def test_truncated_video(tmp_path: Path, name: str, codec: str, options: dict, fraction: float) -> None:
     path = truncate(write_video(tmp_path / name, 25, codec, container_options=options), fraction)
     with pytest.raises(VideoError) as caught:
