@@ -171,13 +171,14 @@ def _swap(temporary: Path, target: Path) -> None:
     try:
         # A rename onto an empty folder replaces it.
         target.rename(old)
-        try:
-            temporary.rename(target)
-        except BaseException:
+        temporary.rename(target)
+    except BaseException:
+        if not target.exists():
             old.rename(target)
-            raise
+        raise
     finally:
-        shutil.rmtree(old, ignore_errors=True)
+        if target.exists():
+            shutil.rmtree(old, ignore_errors=True)
 
 
 def _output_error(target: Path, error: OSError) -> OutputError:

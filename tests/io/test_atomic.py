@@ -140,7 +140,10 @@ def test_a_folder_filled_meanwhile_is_not_overwritten(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["out"]
 
 
-def test_a_failed_swap_restores_the_old_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("error", [OSError(5, "Input/output error"), KeyboardInterrupt()])
+def test_a_failed_swap_restores_the_old_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
     target = tmp_path / "out"
     target.mkdir()
     (target / "old.txt").write_text("old")
@@ -148,11 +151,11 @@ def test_a_failed_swap_restores_the_old_folder(tmp_path: Path, monkeypatch: pyte
 
     def failing(self: Path, other: Path) -> Path:
         if self.name.endswith(".tmp") and other == target and not self.name.endswith(".old.tmp"):
-            raise OSError(5, "Input/output error")
+            raise error
         return rename(self, other)
 
     monkeypatch.setattr(Path, "rename", failing)
-    with pytest.raises(OutputError, match="Input/output error"), atomic_directory(target, overwrite=True):
+    with pytest.raises((OutputError, KeyboardInterrupt)), atomic_directory(target, overwrite=True):
         pass
     assert os.listdir(tmp_path) == ["out"] and os.listdir(target) == ["old.txt"]
 

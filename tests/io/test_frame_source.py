@@ -18,6 +18,8 @@ CONTAINERS = [
     ("v.mp4", "mpeg4", {}),
     ("v.mp4", "libx264", {"movflags": "frag_keyframe+empty_moov"}),
     ("v.mkv", "libx264", {}),
+    ("v.mkv", "libx264", {"live": "1"}),  # no index, and a segment of unknown size
+    ("v.mov", "mjpeg", {}),
     ("v.avi", "mpeg4", {}),
     ("v.avi", "mjpeg", {}),
     ("v.ts", "libx264", {}),
