@@ -8,9 +8,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from data_synth.kinematics import Array
-from data_synth.settings import CameraSettings, IntrinsicsSettings
+from data_synth.settings_picture import CameraSettings, IntrinsicsSettings
+
+Bounds = tuple[float, float, float, float]
+"""x_min, y_min, x_max, y_max in undistorted normalised coordinates."""
 
 
 @dataclass(frozen=True)
@@ -73,12 +77,26 @@ class Camera:
             raise ValueError(f"distortion: expected an invertible model over the picture, found {self.distortion}")
         return xy, np.linalg.inv(jacobian) / [self.fx, self.fy]
 
-    def bounds(self) -> tuple[float, float, float, float]:
-        """x_min, y_min, x_max, y_max of the picture in undistorted normalised coordinates, at the middles of its sides."""
+    def bounds(self) -> Bounds:
+        """Largest upright rectangle about the axis that is certainly in the picture: through the middles of its sides."""
         right, bottom = self.width - 0.5, self.height - 0.5
         sides = np.array([[-0.5, self.cy], [self.cx, -0.5], [right, self.cy], [self.cx, bottom]])
         xy, _ = self.rays(sides)
         return float(xy[0, 0]), float(xy[1, 1]), float(xy[2, 0]), float(xy[3, 1])
+
+    def extent(self) -> Bounds:
+        """Upright rectangle that holds the whole picture."""
+        u, v = np.linspace(-0.5, self.width - 0.5, 33), np.linspace(-0.5, self.height - 0.5, 33)
+        border = [np.stack([u, np.full(33, v[i])], -1) for i in (0, -1)] + [
+            np.stack([np.full(33, u[i]), v], -1) for i in (0, -1)
+        ]
+        xy, _ = self.rays(np.concatenate(border))
+        return float(xy[:, 0].min()), float(xy[:, 1].min()), float(xy[:, 0].max()), float(xy[:, 1].max())
+
+    def contains(self, uv: Array) -> NDArray[np.bool_]:
+        """Whether pixels (..., 2) are inside the picture; False for NaN."""
+        with np.errstate(invalid="ignore"):
+            return ((uv >= -0.5) & (uv <= [self.width - 0.5, self.height - 0.5])).all(-1)
 
     def to_dict(self) -> dict:
         """The camera as an entry of stereo.yaml."""

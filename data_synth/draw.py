@@ -1,4 +1,4 @@
-"""Draw one articulated instrument into a batch of pictures: shaft, metal wrist, two jaws. torch, float32."""
+"""Draw instruments and foreground tissue into a batch of pictures, and the shadows they throw. torch, float32."""
 
 from __future__ import annotations
 
@@ -7,24 +7,19 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from data_synth.instruments import (
-    DARK_GREY,
-    MARGIN_PX,
-    METAL,
-    Cylinders,
-    Pixels,
-    Surface,
-    edge,
-    hit_capsule,
-    hit_cylinder,
-    light_cylinder,
-    make_cylinders,
-)
+from data_synth.instruments import Cylinders, Pixels, dot3, edge, hit_capsule, hit_cylinder, make_cylinders, unit3
+from data_synth.materials import Finish, Surface, light_cylinder
 
+MARGIN_PX = 4.0
+"""Pixels are drawn this many blurs (and at least pixels) outside the outline."""
 JAW_LENGTH_MM = 9.0
 JAW_RADIUS_MM = 1.3
 JAW_OPENING_RAD = 0.30
 """Half the angle between the jaws."""
+CLEVIS_RATIO = 0.74
+"""Radius of the clevis over that of the shaft."""
+PENUMBRA_MM = 1.6
+"""Half-width of a shadow's soft border."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +33,10 @@ class RayMap:
 
 @dataclass(frozen=True)
 class InstrumentPoses:
-    """An instrument in one camera for K poses, float64, mm: axis point at s = 0 and direction, side of the jaws (K, 3); ends (K,)."""
+    """An instrument in one camera: axis point at s = 0, direction, side of the jaws (B, R, 3); coordinates of ends (B, R); float64, mm.
+
+    R is 1, or the number of groups of rows that are read at different times.
+    """
 
     p_axis: Tensor
     v_axis: Tensor
@@ -46,17 +44,50 @@ class InstrumentPoses:
     s_end: Tensor
     s_head: Tensor
     radius: float
+    wrist_ratio: float
+
+
+@dataclass(frozen=True)
+class Brush:
+    """What all drawing shares: rays of the camera, the light in its frame (3,), the point spread and the encoding."""
+
+    rays: RayMap
+    camera_p_light: Tensor
+    blur_px: float
+    gamma: float
+
+
+def gather_pixels(brush: Brush, planes: Tensor) -> tuple[Tensor, Pixels]:
+    """Flat indices (M,) into (B, H, W), and the pixels, on the positive side of all planes (B, R, P, 3) or a margin outside.
+
+    The planes' (x, y) parts are unit: values are distances in normalised coordinates.
+    """
+    height, width = brush.rays.xy.shape[:2]
+    batch, rows, count = planes.shape[:3]
+    group = torch.arange(height, device=planes.device) * rows // height
+    margin = MARGIN_PX * max(1.0, brush.blur_px) / brush.rays.focal_px
+    x, y = brush.rays.xy.unbind(-1)
+    mask = torch.ones((batch, height, width), dtype=torch.bool, device=planes.device)
+    for i in range(count):
+        plane = planes[:, group, i, :, None].float()
+        mask &= torch.addcmul(plane[:, :, 2] + plane[:, :, 0] * x, plane[:, :, 1], y) > -margin
+    flat = mask.flatten().nonzero()[:, 0]
+    inside = flat % (height * width)
+    image = torch.div(flat, height * width, rounding_mode="floor")
+    pose = image * rows + group[torch.div(inside, width, rounding_mode="floor")]
+    return flat, Pixels(brush.rays.xy.flatten(0, 1)[inside], brush.rays.jacobian[inside], pose)
 
 
 def _outline(poses: InstrumentPoses) -> Tensor:
-    """Three half-planes (K, 3, 3) in normalised coordinates, unit in (x, y), positive inside, that hold the whole instrument."""
+    """Three half-planes (B, R, 3, 3), unit in (x, y), positive inside, that hold the whole instrument."""
     reach = JAW_LENGTH_MM * torch.sin(torch.tensor(JAW_OPENING_RAD)) + JAW_RADIUS_MM
-    cylinders = make_cylinders(poses.p_axis, poses.v_axis, torch.zeros_like(poses.p_axis))
+    p, v = poses.p_axis, poses.v_axis
+    cylinders = make_cylinders(p.flatten(0, 1), v.flatten(0, 1), torch.zeros_like(p.flatten(0, 1)))
     wide = torch.clamp(torch.clamp(reach, min=poses.radius) / cylinders.distance, max=0.95)[:, None]
     u, w = cylinders.frame[:, 0], cylinders.frame[:, 1]
     cosine = torch.sqrt(1.0 - wide * wide)
-    tip = poses.p_axis + (poses.s_head + JAW_LENGTH_MM + JAW_RADIUS_MM)[:, None] * poses.v_axis
-    before = poses.p_axis + (poses.s_end - 15.0)[:, None] * poses.v_axis
+    tip = (p + (poses.s_head + JAW_LENGTH_MM + JAW_RADIUS_MM)[..., None] * v).flatten(0, 1)
+    before = (p + (poses.s_end - 15.0)[..., None] * v).flatten(0, 1)
     tip_xy, before_xy = tip[:, :2] / tip[:, 2:], before[:, :2] / before[:, 2:]
     back = torch.nn.functional.normalize(before_xy - tip_xy, dim=-1)
     cap = torch.cat([back, -(back * tip_xy).sum(-1, keepdim=True)], dim=-1).float()
@@ -64,98 +95,78 @@ def _outline(poses: InstrumentPoses) -> Tensor:
     clear = ((before_xy - tip_xy).norm(dim=-1, keepdim=True) > 0.05) & (before[:, 2:] > 5.0) & (tip[:, 2:] > 5.0)
     cap = torch.where(clear, cap, cap.new_tensor([0.0, 0.0, 1.0]))
     planes = torch.stack([cosine * w + wide * u, wide * u - cosine * w, cap], dim=1)
-    return planes / planes[..., :2].norm(dim=-1, keepdim=True).clamp_min(1e-6)
+    planes = planes / planes[..., :2].norm(dim=-1, keepdim=True).clamp_min(1e-6)
+    return planes.unflatten(0, p.shape[:2])
 
 
-def _gather(rays: RayMap, poses: InstrumentPoses, batch: int) -> tuple[Tensor, Pixels]:
-    """Flat indices (M,) into (B, H, W), and the pixels, that the instrument can touch."""
-    height, width = rays.xy.shape[:2]
-    rows = len(poses.s_end) // batch  # 1, or a pose for every group of rows
-    group = torch.arange(height, device=rays.xy.device) * rows // height
-    planes = _outline(poses).unflatten(0, (batch, rows))[:, group]  # (B, H, 3, 3)
-    margin = MARGIN_PX / rays.focal_px
-    mask = torch.ones((batch, height, width), dtype=torch.bool, device=rays.xy.device)
-    for i in range(3):
-        plane = planes[:, :, i, :, None]
-        mask &= (
-            torch.addcmul(plane[:, :, 2] + plane[:, :, 0] * rays.xy[..., 0], plane[:, :, 1], rays.xy[..., 1]) > -margin
-        )
-    flat = mask.flatten().nonzero()[:, 0]
-    inside = flat % (height * width)
-    pose = (
-        torch.div(flat, height * width, rounding_mode="floor") * rows
-        + group[torch.div(inside, width, rounding_mode="floor")]
-    )
-    return flat, Pixels(rays.xy.flatten(0, 1)[inside], rays.jacobian[inside], pose)
-
-
-def draw_instrument(
-    picture: Tensor,
-    rays: RayMap,
-    poses: InstrumentPoses,
-    camera_p_light: Tensor,
-    wrist_ratio: float,
-    blur_px: float,
-    gamma: float,
-) -> None:
+def draw_instrument(picture: Tensor, brush: Brush, poses: InstrumentPoses, finish: Finish) -> None:
     """Paint the instrument over `picture` (B, H, W, 3), encoded values 0 to 1, in place."""
-    batch = len(picture)
-    flat, pixels = _gather(rays, poses, batch)
+    flat, pixels = gather_pixels(brush, _outline(poses))
     if not len(flat):
         return
     values = picture.view(-1, 3)
-    colour = values[flat]
-    colour = _jaws(colour, pixels, rays, poses, camera_p_light, blur_px, gamma)
-    cylinders = make_cylinders(poses.p_axis, poses.v_axis, camera_p_light.to(poses.p_axis).expand_as(poses.p_axis))
-    s_end, s_head = poses.s_end.float(), poses.s_head.float()
-    wrist_from, everywhere = s_end - 1.0, torch.full_like(s_end, -1e4)
+    p, v = poses.p_axis.flatten(0, 1), poses.v_axis.flatten(0, 1)
+    s_end, s_head = poses.s_end.flatten(), poses.s_head.flatten()
+    colour = _jaws(values[flat], brush, pixels, p + s_head[:, None] * v, v, poses.side.flatten(0, 1))
+    cylinders = make_cylinders(p, v, brush.camera_p_light.expand_as(p))
+    s_sleeve = s_end + 0.55 * (s_head - s_end)
+    far = torch.full_like(s_end, -1e4)
     for ratio, surface, s_from, s_to in (
-        (wrist_ratio, METAL, wrist_from, s_head),
-        (1.0, DARK_GREY, everywhere, s_end),
+        (CLEVIS_RATIO, finish.clevis, s_sleeve - 1.0, s_head + 1.0),
+        (poses.wrist_ratio, finish.sleeve, s_end - 1.0, s_sleeve),
+        (1.0, finish.shaft, far, s_end),
     ):
-        colour = _cylinder(colour, pixels, cylinders, ratio * poses.radius, surface, s_from, s_to, blur_px, gamma)
+        part = _Part(ratio * poses.radius, surface, s_from.float(), s_to.float())
+        colour = _cylinder(colour, brush, pixels, cylinders, part)
     values[flat] = colour
 
 
-def _cylinder(
-    colour: Tensor,
-    pixels: Pixels,
-    cylinders: Cylinders,
-    radius: float,
-    surface: Surface,
-    s_from: Tensor,
-    s_to: Tensor,
-    blur_px: float,
-    gamma: float,
-) -> Tensor:
-    """Paint a cylinder between axis coordinates (K,) over colours (M, 3)."""
-    hit = hit_cylinder(pixels, cylinders, radius, blur_px)
-    before = edge((s_to[pixels.pose] - hit.s) / hit.s_per_px, blur_px)
-    after = edge((hit.s - s_from[pixels.pose]) / hit.s_per_px, blur_px)
+@dataclass(frozen=True)
+class _Part:
+    """A piece of an instrument between axis coordinates (K,), mm."""
+
+    radius: float
+    surface: Surface
+    s_from: Tensor
+    s_to: Tensor
+
+
+def _cylinder(colour: Tensor, brush: Brush, pixels: Pixels, cylinders: Cylinders, part: _Part) -> Tensor:
+    """Paint a part over colours (M, 3)."""
+    hit = hit_cylinder(pixels, cylinders, part.radius, brush.blur_px)
+    before = edge((part.s_to[pixels.pose] - hit.s) / hit.s_per_px, brush.blur_px)
+    after = edge((hit.s - part.s_from[pixels.pose]) / hit.s_per_px, brush.blur_px)
     cover = (hit.inside * before * after)[:, None]
-    painted = light_cylinder(hit, cylinders.light[pixels.pose], surface, gamma)
-    return torch.lerp(colour, painted, cover)
+    return torch.lerp(colour, light_cylinder(hit, cylinders.light[pixels.pose], part.surface, brush.gamma), cover)
 
 
-def _jaws(
-    colour: Tensor,
-    pixels: Pixels,
-    rays: RayMap,
-    poses: InstrumentPoses,
-    camera_p_light: Tensor,
-    blur_px: float,
-    gamma: float,
-) -> Tensor:
+def _jaws(colour: Tensor, brush: Brush, pixels: Pixels, head: Tensor, v_axis: Tensor, side: Tensor) -> Tensor:
     """Paint the two jaws, rods that open about the head point, over colours (M, 3)."""
-    head = poses.p_axis + poses.s_head[:, None] * poses.v_axis
     for sign in (-1.0, 1.0):
         angle = torch.tensor(sign * JAW_OPENING_RAD)
-        tip = head + JAW_LENGTH_MM * (torch.cos(angle) * poses.v_axis + torch.sin(angle) * poses.side)
-        inside, normal, point = hit_capsule(pixels, head.float(), tip.float(), JAW_RADIUS_MM, blur_px, rays.focal_px)
-        to_light = torch.nn.functional.normalize(camera_p_light.float() - point, dim=-1)
-        facing = torch.clamp((normal * to_light).sum(-1), min=0.0)
-        linear = 0.05 + 0.35 * facing + 0.6 * facing**24
-        colour = torch.lerp(
-            colour, (torch.clamp(linear, max=1.0) ** (1.0 / gamma))[:, None].expand(-1, 3), inside[:, None]
+        tip = head + JAW_LENGTH_MM * (torch.cos(angle) * v_axis + torch.sin(angle) * side)
+        inside, normal, point = hit_capsule(
+            pixels, head.float(), tip.float(), JAW_RADIUS_MM, brush.blur_px, brush.rays.focal_px
         )
+        facing = torch.clamp(dot3(normal, unit3(brush.camera_p_light.float() - point)), min=0.0)
+        linear = torch.clamp(0.04 + 0.30 * facing + 0.6 * facing**24, max=1.0)
+        colour = torch.lerp(colour, (linear ** (1.0 / brush.gamma))[:, None].expand(-1, 3), inside[:, None])
     return colour
+
+
+def shadow(points: Tensor, camera_p_light: Tensor, poses: InstrumentPoses) -> Tensor:
+    """How much (B, h, w), 0 to 1, of the light to camera-frame points (B, h, w, 3) the instrument takes away.
+
+    The ray from the light comes as near to the instrument's axis as `gap`; borders are soft over the penumbra.
+    """
+    p, v = poses.p_axis[:, :, None].float(), poses.v_axis[:, :, None].float()  # (B, R, 1, 3)
+    light = camera_p_light.float()
+    d = unit3(points - light)
+    w = light - p
+    dv, wv, wd = dot3(d, v), dot3(w, v), dot3(w, d)
+    s = (wv - wd * dv) / (1.0 - dv * dv).clamp_min(1e-4)
+    s = torch.minimum(s, (poses.s_head + 0.7 * JAW_LENGTH_MM).float()[:, :, None])
+    nearest = p + s[..., None] * v - light
+    along = dot3(nearest, d)
+    gap = torch.sqrt((dot3(nearest, nearest) - along * along).clamp_min(0.0))
+    return torch.sigmoid(2.0 * (poses.radius - gap) / PENUMBRA_MM) * (along > 0)

@@ -86,7 +86,7 @@ def plan_path(
     half_range = np.concatenate([arm_half * (settings.laparoscope == "moving"), arm_half])
     centre = np.concatenate([scene.laparoscope_home, scene.instrument_home])
     if settings.kind == "smooth":
-        path = _smooth_path(centre, half_range, generator)
+        path = _smooth_path(centre, half_range, settings.speed, generator)
         return path, START_S + np.arange(frames) / settings.frame_rate_hz
     if settings.kind == "grid":
         stops = _grid_stops(settings, frames, generator)
@@ -101,9 +101,9 @@ def _split(readings: Array, in_view: InView) -> Array:
     return in_view(readings[:, :3], readings[:, 3:])
 
 
-def _smooth_path(centre: Array, half_range: Array, generator: np.random.Generator) -> JointPath:
+def _smooth_path(centre: Array, half_range: Array, speed: float, generator: np.random.Generator) -> JointPath:
     """Three incommensurable sines a joint, below 0.4 Hz: hand speeds of a few centimetres a second."""
-    frequency = generator.uniform(0.05, 0.4, (3, 6)) * np.array([1.0, 0.6, 0.35])[:, None]
+    frequency = speed * generator.uniform(0.05, 0.4, (3, 6)) * np.array([1.0, 0.6, 0.35])[:, None]
     amplitude = generator.uniform(0.5, 1.0, (3, 6))
     amplitude /= amplitude.sum(0)
     none = np.zeros((0, 6))

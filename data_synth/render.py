@@ -1,53 +1,178 @@
-"""Pictures of a world: tissue, instrument, vignette, sensor noise. Draws with torch on any device; truth is made elsewhere."""
+"""Pictures of a world: tissue, instruments, light, smoke, and the camera's ways. Draws with torch on any device; truth is made elsewhere."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from data_synth.cameras import Camera
-from data_synth.draw import InstrumentPoses, RayMap, draw_instrument
+from data_synth.draw import Brush, InstrumentPoses, RayMap, draw_instrument, shadow
+from data_synth.foreground import LoopPoses, draw_loop
+from data_synth.instruments import edge
 from data_synth.kinematics import Array, rigid_inverse, transform_points
-from data_synth.tissue import REFERENCE_MM, Tissue, build_tissue, coarse_nodes, intersect, shade
-from data_synth.world import World
+from data_synth.materials import other_finish, own_finish
+from data_synth.props import HEAD_BEYOND_MM, RADIUS_MM, WRIST_MM, OtherInstrument
+from data_synth.sensor import Sensor
+from data_synth.settings import SynthConfig
+from data_synth.textures import filtered_noise
+from data_synth.tissue import COARSE_PX, REFERENCE_MM, Tissue, build_tissue, coarse_nodes, intersect, shade
+from data_synth.truth import SideTruth, side_truth
+from data_synth.world import World, build_world
 
 CAMERA_RIGHT_P_LIGHT = np.array([2.5, -4.5, -1.0])
 """End of the light guide, between and above the two lenses, mm."""
-VIGNETTE = 0.55
-"""Loss of encoded brightness at normalised radius 0.6."""
+SMOKE_COLOUR = (0.74, 0.73, 0.76)
+SMOKE_SPEED = np.array([0.11, -0.07])
+"""Drift of the smoke, pictures a second."""
 
 
 @dataclass(frozen=True)
 class _View:
-    """A camera's fixed maps on the device."""
+    """A camera's fixed maps on the device: rays of all pixels, of the coarse nodes (h, w, 3), and the light that passes (H, W, 1)."""
 
     camera: Camera
     rays: RayMap
     coarse_rays: Tensor
-    coarse_size: tuple[int, int]
-    vignette: Tensor
+    passed: Tensor
 
 
 class Renderer:
-    """Renders frames of a world."""
+    """Renders frames of a world; the same world gives the same pictures."""
 
     def __init__(self, world: World, device: str | torch.device = "cpu") -> None:
         self.world = world
         self.device = torch.device(device)
-        self.gamma = world.config.camera.gamma
-        home = world.scene.base_T_camera_home
-        self.tissue: Tissue = build_tissue(world.config.seed, home, self.gamma, self.device)
+        self.settings, self.look = world.config.camera, world.config.look
+        seed, home = world.config.seed, world.scene.base_T_camera_home
+        self.tissue: Tissue = build_tissue(seed, home, self.look, self.settings.gamma, self.device)
+        self.sensor = Sensor(self.settings, seed, len(world.frame_times_s), self.device)
         self.views = {side: self._view(camera) for side, camera in world.cameras.items()}
-        self._noise = torch.randn(1 << 22, generator=torch.Generator().manual_seed(world.config.seed)).to(self.device)
+        smoke = filtered_noise(np.random.default_rng([seed, 5]), 256, 1.0, 12.0, 1.2)
+        self._smoke = self._tensor(np.clip(0.5 + 0.3 * smoke, 0.05, 1.0))[None, None]
 
     @property
     def size(self) -> tuple[int, int]:
         """Height and width of the pictures."""
-        camera = self.world.config.camera
-        return camera.height_px, camera.width_px
+        return self.settings.height_px, self.settings.width_px
+
+    def render(self, side: str, frames: Array) -> Tensor:
+        """Pictures (B, H, W, 3), uint8 RGB, of one camera at frame indices (B,)."""
+        with torch.inference_mode():
+            return self.sensor.expose(self.encoded(side, frames), frames, side)
+
+    def encoded(self, side: str, frames: Array) -> Tensor:
+        """Encoded pictures (B, H, W, 3), 0 to 1, before the sensor; averaged over the exposure, woven of two fields."""
+        times, delay = self.world.frame_times_s[frames], self.settings.field_delay_s
+        if not delay:
+            return self._exposure(side, frames, times)
+        even, odd = (self._exposure(side, frames, times + shift) for shift in (-0.5 * delay, 0.5 * delay))
+        even[:, 1::2] = odd[:, 1::2]
+        return even
+
+    def _exposure(self, side: str, frames: Array, times: Array) -> Tensor:
+        """Mean picture of the instants of the exposure."""
+        count = self.settings.exposure_samples if self.settings.exposure_s else 1
+        shifts = self.settings.exposure_s * ((np.arange(count) + 0.5) / count - 0.5)
+        picture = self._instant(side, frames, times + shifts[0])
+        for shift in shifts[1:]:
+            picture += self._instant(side, frames, times + shift)
+        return picture if count == 1 else picture.div_(count)
+
+    def _instant(self, side: str, frames: Array, times: Array) -> Tensor:
+        """Picture at one instant, or with rows read one after the other."""
+        world, view = self.world, self.views[side]
+        rows = len(view.coarse_rays) if self.settings.readout_s else 1
+        offsets = self.settings.readout_s * ((np.arange(rows) + 0.5) / rows - 0.5)
+        times, frames = times[:, None] + offsets, np.broadcast_to(frames[:, None], (len(frames), rows))
+        base_T_camera = world.base_T_camera(side, times)  # (B, R, 4, 4)
+        light = self._tensor(transform_points(world.camera_T_camera_right(side), CAMERA_RIGHT_P_LIGHT), torch.float64)
+        brush = Brush(view.rays, light, self.settings.blur_px, self.settings.gamma)
+        instruments = [
+            (self._other(other, base_T_camera, times), other_finish(other.kind)) for other in world.props.others
+        ]
+        instruments.append((self.own_poses(side, frames, times), own_finish(self.look)))
+        picture = self._background(view, base_T_camera, light, [poses for poses, _ in instruments])
+        for poses, finish in instruments:
+            draw_instrument(picture, brush, poses, finish)
+        for loop in world.props.loops:
+            a, b = (
+                self._tensor(transform_points(rigid_inverse(base_T_camera), p)) for p in (loop.base_p_a, loop.base_p_b)
+            )
+            draw_loop(picture, brush, LoopPoses(a, b, loop.radius_mm), self.tissue)
+        if self.look.smoke:
+            self._blow_smoke(picture, view, times[:, 0])
+        return picture.mul_(view.passed)
+
+    def _background(
+        self, view: _View, base_T_camera: Array, light: Tensor, instruments: list[InstrumentPoses]
+    ) -> Tensor:
+        """Lit tissue with the instruments' shadows."""
+        tissue_T_camera = self._tensor(rigid_inverse(self.tissue.base_T_tissue) @ base_T_camera)
+        surface = intersect(self.tissue, view.coarse_rays, tissue_T_camera, light.float())
+        gain = (REFERENCE_MM / surface.light_distance) ** (2.0 / self.settings.gamma)
+        gain = torch.clamp(gain, max=2.0) * self.look.brightness
+        if self.look.shadow:
+            R, origin = tissue_T_camera[..., :3, :3], tissue_T_camera[..., None, :3, 3]
+            camera_p_surface = (surface.points - origin) @ R
+            dark = torch.stack([shadow(camera_p_surface, light, poses) for poses in instruments]).amax(0)
+            gain = gain * (1.0 - self.look.shadow * dark)
+        return shade(self.tissue, surface, gain, self.size)
+
+    def own_poses(self, side: str, frames: Array, times: Array) -> InstrumentPoses:
+        """The logged instrument in a camera; `frames` and `times` are (B, R)."""
+        shaft, camera_T_rcm = self.world.shaft(side, frames, times)
+        v = shaft.camera_v_axis
+        s_head = np.einsum("...i,...i->...", shaft.camera_p_head - shaft.camera_p_rcm, v)
+        return self._poses(
+            shaft.camera_p_rcm,
+            v,
+            camera_T_rcm[..., :3, 0],
+            shaft.s_end_mm,
+            s_head,
+            shaft.radius_mm,
+            self.look.wrist_radius_ratio,
+        )
+
+    def _other(self, other: OtherInstrument, base_T_camera: Array, times: Array) -> InstrumentPoses:
+        """An instrument that is not logged."""
+        camera_T_base = rigid_inverse(base_T_camera)
+        p = transform_points(camera_T_base, other.base_p_rcm)
+        along = transform_points(camera_T_base, other.head(times)) - p
+        s_head = np.linalg.norm(along, axis=-1)
+        return self._poses(
+            p,
+            along / s_head[..., None],
+            camera_T_base[..., :3, 0],
+            s_head - WRIST_MM,
+            s_head + HEAD_BEYOND_MM,
+            RADIUS_MM,
+            0.9,
+        )
+
+    def _poses(
+        self, p: Array, v: Array, near_side: Array, s_end: Array, s_head: Array, radius: float, ratio: float
+    ) -> InstrumentPoses:
+        sideways = np.cross(v, near_side)
+        sideways /= np.linalg.norm(sideways, axis=-1, keepdims=True)
+        tensors = [self._tensor(a, torch.float64) for a in (p, v, sideways, s_end, s_head)]
+        return InstrumentPoses(*tensors, radius=radius, wrist_ratio=ratio)
+
+    def _blow_smoke(self, picture: Tensor, view: _View, times: Array) -> None:
+        """Mix drifting smoke over the pictures, in place."""
+        rows, columns = view.coarse_rays.shape[:2]
+        v, u = np.meshgrid(np.linspace(-0.5, 0.5, rows), np.linspace(-0.5, 0.5, columns), indexing="ij")
+        grid = np.stack([u, v], axis=-1) + (SMOKE_SPEED * times[:, None])[:, None, None]
+        smoke = self._smoke.expand(len(times), -1, -1, -1)
+        density = F.grid_sample(smoke, self._tensor(grid), padding_mode="reflection", align_corners=False)
+        full = ((rows - 1) * COARSE_PX + 1, (columns - 1) * COARSE_PX + 1)
+        density = F.interpolate(density, size=full, mode="bilinear", align_corners=True)[
+            :, 0, : self.size[0], : self.size[1], None
+        ]
+        picture.lerp_(torch.tensor(SMOKE_COLOUR, device=self.device), self.look.smoke * density)
 
     def _tensor(self, values: Array, dtype: torch.dtype = torch.float32) -> Tensor:
         return torch.as_tensor(np.array(values), dtype=dtype, device=self.device)
@@ -55,55 +180,31 @@ class Renderer:
     def _view(self, camera: Camera) -> _View:
         v, u = np.meshgrid(np.arange(camera.height), np.arange(camera.width), indexing="ij")
         xy, jacobian = camera.rays(np.stack([u, v], axis=-1).astype(np.float64))
-        nodes, coarse_size = coarse_nodes(camera.width, camera.height)
-        coarse_xy, _ = camera.rays(nodes)
-        coarse_rays = np.concatenate([coarse_xy, np.ones((len(coarse_xy), 1))], axis=-1)
-        vignette = 1.0 - VIGNETTE * np.minimum((coarse_xy**2).sum(-1) / 0.36, 1.2) ** 1.3
+        coarse_xy, _ = camera.rays(coarse_nodes(camera.width, camera.height))
+        coarse_rays = np.concatenate([coarse_xy, np.ones((*coarse_xy.shape[:2], 1))], axis=-1)
         rays = RayMap(self._tensor(xy), self._tensor(jacobian.reshape(-1, 4)), 0.5 * (camera.fx + camera.fy))
-        return _View(camera, rays, self._tensor(coarse_rays), coarse_size, self._tensor(vignette))
+        passed = self._tensor(1.0 - self.settings.vignette * np.minimum((xy**2).sum(-1) / 0.36, 1.2) ** 1.3)
+        if self.settings.round_field:
+            off = np.hypot(u - (camera.width - 1.0) / 2.0, v - (camera.height - 1.0) / 2.0)
+            passed *= edge(self._tensor(self.settings.round_field * camera.width / 2.0 - off), 1.5)
+        return _View(camera, rays, self._tensor(coarse_rays), passed[..., None])
 
-    def render(self, side: str, frames: Array) -> Tensor:
-        """Pictures (B, H, W, 3), uint8 RGB, of one camera at frame indices (B,)."""
-        with torch.inference_mode():
-            picture = self._encoded(side, frames)
-            return self._expose(picture, frames, side)
 
-    def _encoded(self, side: str, frames: Array) -> Tensor:
-        """Encoded pictures (B, H, W, 3), 0 to 1, without noise."""
-        world, view, look = self.world, self.views[side], self.world.config.look
-        times = world.frame_times_s[frames]
-        light = transform_points(world.camera_T_camera_right(side), CAMERA_RIGHT_P_LIGHT)
-        tissue_T_camera = rigid_inverse(self.tissue.base_T_tissue) @ world.base_T_camera(side, times)
-        surface = intersect(self.tissue, view.coarse_rays, self._tensor(tissue_T_camera), self._tensor(light))
-        gain = torch.clamp((REFERENCE_MM / surface.light_distance) ** (2.0 / self.gamma), max=2.0) * view.vignette
-        size = (view.camera.height, view.camera.width)
-        picture = shade(self.tissue, surface, gain, view.coarse_size, size)
-        poses = self._instrument(side, frames, times)
-        light_tensor = self._tensor(light, torch.float64)
-        draw_instrument(
-            picture, view.rays, poses, light_tensor, look.wrist_radius_ratio, world.config.camera.blur_px, self.gamma
-        )
-        return picture
+def render_frames(
+    config: SynthConfig, count: int | None = None, side: str = "right", device: str = "cpu"
+) -> tuple[Tensor, SideTruth]:
+    """Pictures in memory with their truth, for one camera.
 
-    def _instrument(self, side: str, frames: Array, times: Array) -> InstrumentPoses:
-        shaft, camera_T_rcm = self.world.shaft(side, frames, times)
-        v = shaft.camera_v_axis
-        s_head = np.einsum("ki,ki->k", shaft.camera_p_head - shaft.camera_p_rcm, v)
-        sideways = np.cross(v, camera_T_rcm[:, :3, 0])
-        sideways /= np.linalg.norm(sideways, axis=-1, keepdims=True)
-        p, v, sideways, s_end, s_head = (
-            self._tensor(a, torch.float64) for a in (shaft.camera_p_rcm, v, sideways, shaft.s_end_mm, s_head)
-        )
-        return InstrumentPoses(p, v, sideways, s_end, s_head, shaft.radius_mm)
-
-    def _expose(self, picture: Tensor, frames: Array, side: str) -> Tensor:
-        """Sensor noise and rounding: (B, H, W, 3) uint8."""
-        levels = picture.mul_(255.0)
-        sigma = self.world.config.camera.noise_levels
-        if sigma > 0.0:
-            count = levels[0].numel()
-            generator = np.random.default_rng([self.world.config.seed, 2, int(frames[0]), side == "left"])
-            for image in levels:
-                start = int(generator.integers(0, len(self._noise) - count))
-                image.add_(self._noise[start : start + count].view_as(image), alpha=sigma)
-        return levels.add_(0.5).clamp_(0.0, 255.0).to(torch.uint8)
+    Args:
+        config: what to render.
+        count: number of frames instead of `config.motions`.
+        side: "right" or "left".
+        device: torch device that draws; the pictures stay there.
+    Returns:
+        pictures (N, 3, H, W) uint8 RGB, as the camera gives them (without H.264), and the truth of all N frames.
+    """
+    world = build_world(config if count is None else replace(config, motions=count))
+    renderer, total = Renderer(world, device), len(world.frame_times_s)
+    step = 16 if renderer.device.type == "cuda" else 1
+    batches = [renderer.render(side, np.arange(i, min(i + step, total))) for i in range(0, total, step)]
+    return torch.cat(batches).movedim(-1, 1).contiguous(), side_truth(world, side)

@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
+from data_synth.settings_picture import CameraSettings, LookSettings
+
 _STRICT = ConfigDict(extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
 Vector = tuple[float, float, float]
@@ -90,44 +92,6 @@ class LineStudyConfig:
 
 
 @dataclass(frozen=True, config=_STRICT)
-class IntrinsicsSettings:
-    """One camera of the pair."""
-
-    fx_px: Positive = 702.4
-    """Horizontal focal length."""
-    fy_px: Positive = 701.1
-    """Vertical focal length."""
-    cx_px: float = 322.7
-    """Column of the principal point."""
-    cy_px: float = 236.4
-    """Row of the principal point."""
-    distortion: tuple[float, float, float, float, float] = (-0.2, 0.05, 0.0006, -0.0004, 0.0)
-    """k1, k2, p1, p2, k3."""
-
-
-@dataclass(frozen=True, config=_STRICT)
-class CameraSettings:
-    """The stereo laparoscope's cameras and what their optics and electronics do to the picture."""
-
-    width_px: Annotated[int, Field(ge=64)] = 640
-    """Width of the pictures."""
-    height_px: Annotated[int, Field(ge=64)] = 480
-    """Height of the pictures."""
-    right: IntrinsicsSettings = IntrinsicsSettings()
-    """Right camera."""
-    left: IntrinsicsSettings | None = IntrinsicsSettings(
-        fx_px=699.8, fy_px=698.9, cx_px=315.2, cy_px=241.9, distortion=(-0.19, 0.045, -0.0004, 0.0005, 0.0)
-    )
-    """Left camera; null: a monocular recording."""
-    blur_px: Annotated[float, Field(ge=0.3)] = 0.55
-    """1 sigma of the point spread (optics and pixel together); every edge is an error function of this width."""
-    noise_levels: NonNegative = 1.5
-    """White sensor noise, 1 sigma, in levels of 0 to 255."""
-    gamma: Positive = 2.2
-    """Encoding of linear light."""
-
-
-@dataclass(frozen=True, config=_STRICT)
 class MotionSettings:
     """How the arms move and how that is logged."""
 
@@ -147,6 +111,8 @@ class MotionSettings:
     """Time between two stops (`random` and `grid`); the frame is taken in the middle of the rest."""
     frame_rate_hz: Positive = 30.0
     """Frame rate of `smooth`."""
+    speed: Positive = 1.0
+    """Speed of `smooth`: 1 is a hand of a few centimetres a second."""
     joint_rate_hz: Positive = 50.0
     """Rate of joints.csv."""
     keep_end_in_view: bool = True
@@ -169,20 +135,22 @@ class NoiseSettings:
     """Error of the given stereo extrinsics, translation per axis."""
     stereo_deg: NonNegative = 0.0
     """Error of the given stereo extrinsics, rotation per axis."""
+    joint_offset_deg: NonNegative = 0.0
+    """Constant error of each logged revolute joint, drawn once, 1 sigma: truth = reading + offset."""
+    joint_offset_mm: NonNegative = 0.0
+    """Constant error of each logged prismatic joint."""
+    clock_offset_s: float = 0.0
+    """Time of a joint sample minus the time of the frame that shows it; not told to the calibration."""
+    timestamp_noise_s: NonNegative = 0.0
+    """White noise of the frames' recorded times."""
+    frame_jitter_s: NonNegative = 0.0
+    """Spread of the instants at which frames are taken; recorded correctly."""
+    dropped_fraction: Annotated[float, Field(ge=0, le=0.9)] = 0.0
+    """Share of frames that never arrive (`smooth`)."""
     shaft_diameter_error_mm: float = 0.0
     """Given minus true diameter of the shaft."""
     head_point_px: NonNegative = 0.3
     """Noise of head_points.csv."""
-
-
-@dataclass(frozen=True, config=_STRICT)
-class LookSettings:
-    """What the pictures show."""
-
-    shaft: Literal["dark_grey", "carbon", "anodised"] = "dark_grey"
-    """Surface of the shaft."""
-    wrist_radius_ratio: Annotated[float, Field(gt=0.3, le=1.0)] = 0.94
-    """Radius of the metal wrist over that of the shaft."""
 
 
 @dataclass(frozen=True, config=_STRICT)

@@ -6,9 +6,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from data_synth.cameras import Camera
 from data_synth.contours import front_point, to_image, view_cylinder, visible_interval
-from data_synth.kinematics import Array
+from data_synth.kinematics import Array, rigid_inverse
 from data_synth.world import World
 
 POLYLINE_POINTS = 64
@@ -31,7 +30,8 @@ class SideTruth:
         n_contour: (N, 2, 3) unit normals of the two contour planes.
         n_axis: (N, 3) unit normal of the axis plane.
         contour_xy: (N, 2, 2, 2) first and last visible point of each edge.
-        contour_uv: (N, 2, P, 2) points along each visible edge.
+        contour_uv: (N, 2, P, 2) points along each edge where it can be in the picture.
+        contour_visible: (N, 2, P) which of them are inside the picture and its bright field and not hidden by tissue.
         axis_xy: (N, 2, 2) first and last visible point of the axis.
         end_xy: (N, 2) projection of the end circle's centre.
         end_uv: (N, 2) the same in raw pixels.
@@ -51,6 +51,7 @@ class SideTruth:
     n_axis: Array
     contour_xy: Array
     contour_uv: Array
+    contour_visible: Array
     axis_xy: Array
     end_xy: Array
     end_uv: Array
@@ -69,22 +70,26 @@ class SideTruth:
 def side_truth(world: World, side: str) -> SideTruth:
     """Truth of one camera over all frames."""
     camera = world.cameras[side]
-    frames = np.arange(len(world.frame_times_s))
-    shaft, camera_T_rcm = world.shaft(side, frames, world.frame_times_s)
+    frames, times = np.arange(len(world.frame_times_s)), world.frame_times_s
+    shaft, camera_T_rcm = world.shaft(side, frames, times)
+    camera_T_base = rigid_inverse(world.base_T_camera(side, times))
     p, v, radius = shaft.camera_p_rcm, shaft.camera_v_axis, shaft.radius_mm
     view = view_cylinder(p, v, radius)
-    low, high = visible_interval(p, v, 0.0, shaft.s_end_mm, camera.bounds())
-    visible = high - low > SHORTEST_VISIBLE_MM
-    end = shaft.axis_point(shaft.s_end_mm)
-    end_visible = visible & (high >= shaft.s_end_mm) & _inside(camera, camera.project(end))
-    low, high = np.where(visible, low, np.nan), np.where(visible, high, np.nan)
+    low, high = visible_interval(p, v, 0.0, shaft.s_end_mm, camera.extent())
+    some = high > low
+    low, high = np.where(some, low, np.nan), np.where(some, high, np.nan)
     s = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, POLYLINE_POINTS)
     axis = p[:, None] + s[..., None] * v[:, None]  # (N, P, 3)
     contact = axis[:, :, None] + np.array([-radius, radius])[:, None] * view.n_contour[:, None]
-    edges = np.moveaxis(contact, 1, 2)  # (N, 2, P, 3)
-    contour_xy = to_image(edges)
-    end = np.where(end_visible[:, None], end, np.nan)
+    lines = np.moveaxis(np.concatenate([contact, axis[:, :, None]], axis=2), 1, 2)  # (N, 3, P, 3): both edges, axis
+    seen = world.in_sight(side, camera_T_base[:, None, None], lines)
+    visible = some & (seen[:, :2].mean(-1) * (high - low)[:, None] > SHORTEST_VISIBLE_MM).all(-1)
+    xy = to_image(np.where(visible[:, None, None, None], lines, np.nan))
+    ends = _seen_ends(xy, seen)
+    end = shaft.axis_point(shaft.s_end_mm)
     front = front_point(end, view, radius)
+    end_visible = visible & world.in_sight(side, camera_T_base, front)
+    end, front = (np.where(end_visible[:, None], point, np.nan) for point in (end, front))
     return SideTruth(
         camera_T_rcm=camera_T_rcm,
         camera_p_rcm=p,
@@ -92,9 +97,10 @@ def side_truth(world: World, side: str) -> SideTruth:
         s_end_mm=shaft.s_end_mm,
         n_contour=view.n_contour,
         n_axis=view.n_axis,
-        contour_xy=contour_xy[:, :, [0, -1]],
-        contour_uv=camera.pixels(contour_xy),
-        axis_xy=to_image(axis[:, [0, -1]]),
+        contour_xy=ends[:, :2],
+        contour_uv=camera.pixels(xy[:, :2]),
+        contour_visible=seen[:, :2] & visible[:, None, None],
+        axis_xy=ends[:, 2],
         end_xy=to_image(end),
         end_uv=camera.project(end),
         end_front_xy=to_image(front),
@@ -106,6 +112,9 @@ def side_truth(world: World, side: str) -> SideTruth:
     )
 
 
-def _inside(camera: Camera, uv: Array) -> Array:
-    u, v = np.nan_to_num(uv[..., 0], nan=-1e9), np.nan_to_num(uv[..., 1], nan=-1e9)
-    return (u >= -0.5) & (v >= -0.5) & (u <= camera.width - 0.5) & (v <= camera.height - 0.5)
+def _seen_ends(xy: Array, seen: Array) -> Array:
+    """First and last visible point (N, L, 2, 2) of polylines (N, L, P, 2)."""
+    first = seen.argmax(-1)
+    last = seen.shape[-1] - 1 - seen[..., ::-1].argmax(-1)
+    index = np.stack([first, last], axis=-1)[..., None]
+    return np.take_along_axis(xy, index, axis=-2)

@@ -1,0 +1,102 @@
+"""What the camera's electronics do to an encoded picture: drift, sharpening, Bayer pattern, noise, compression. torch, float32."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from data_synth.kinematics import Array
+from data_synth.settings_picture import CameraSettings
+
+NOISE_POOL = 1 << 23
+"""Values of white noise drawn once; every picture takes a run of them from a random place."""
+DRIFT_FRAMES = 25.0
+"""Frames over which brightness and colour drift."""
+
+
+class Sensor:
+    """Turns encoded pictures (B, H, W, 3), 0 to 1, into uint8, the same for the same seed, side and frame."""
+
+    def __init__(self, settings: CameraSettings, seed: int, frames: int, device: torch.device) -> None:
+        self.settings = settings
+        self.seed = seed
+        self._pool = torch.randn(NOISE_POOL, generator=torch.Generator().manual_seed(seed)).to(device)
+        self._gains = torch.as_tensor(self._drift(frames), dtype=torch.float32, device=device)
+
+    def _drift(self, frames: int) -> Array:
+        """Colour gains (frames, 3): smooth random walks with the settings' spread."""
+        generator = np.random.default_rng([self.seed, 4])
+        knots = int(frames / DRIFT_FRAMES) + 2
+        values = generator.standard_normal((knots, 3))
+        at = np.arange(frames) / DRIFT_FRAMES
+        smooth = np.stack([np.interp(at, np.arange(knots), column) for column in values.T], axis=-1)
+        gain = 1.0 + self.settings.gain_variation * smooth[:, :1]
+        balance = 1.0 + self.settings.white_balance_variation * smooth[:, 1:]
+        return gain * np.stack([balance[:, 0], np.ones(frames), balance[:, 1]], axis=-1)
+
+    def expose(self, picture: Tensor, frames: Array, side: str) -> Tensor:
+        """Pictures (B, H, W, 3) uint8 of encoded ones, which are used up."""
+        s = self.settings
+        if s.gain_variation or s.white_balance_variation:
+            picture = picture * self._gains[torch.as_tensor(frames, device=picture.device)][:, None, None]
+        if s.sharpening:
+            picture = _sharpen(picture, s.sharpening)
+        levels = picture.clamp_(0.0, 1.0).mul_(255.0)
+        generators = [np.random.default_rng([self.seed, 2, int(frame), side == "left"]) for frame in frames]
+        if s.bayer:
+            levels = _mosaic(levels + self._noise(levels.shape, generators, s.noise_levels))
+        elif s.noise_levels:
+            levels.add_(self._noise(levels.shape, generators, s.noise_levels))
+        if s.colour_noise_levels:
+            levels.add_(self._colour_noise(levels.shape, generators))
+        out = levels.add_(0.5).clamp_(0.0, 255.0).to(torch.uint8)
+        return out if s.jpeg_quality is None else _jpeg(out, s.jpeg_quality)
+
+    def _noise(self, shape: torch.Size, generators: list[np.random.Generator], sigma: float) -> Tensor:
+        """White noise of a batch of pictures, each a run of the pool."""
+        count = shape[1:].numel()
+        starts = [int(g.integers(0, len(self._pool) - count)) for g in generators]
+        return sigma * torch.stack([self._pool[i : i + count].view(shape[1:]) for i in starts])
+
+    def _colour_noise(self, shape: torch.Size, generators: list[np.random.Generator]) -> Tensor:
+        """Noise of red and blue with a coarse grain; green takes the opposite, so that the brightness stays."""
+        small = torch.Size((shape[0], shape[1] // 4 + 1, shape[2] // 4 + 1, 2))
+        coarse = self._noise(small, generators, self.settings.colour_noise_levels).movedim(-1, 1)
+        red_blue = F.interpolate(coarse, size=shape[1:3], mode="bilinear", align_corners=False).movedim(1, -1)
+        green = -(0.30 * red_blue[..., 0] + 0.11 * red_blue[..., 1]) / 0.59
+        return torch.stack([red_blue[..., 0], green, red_blue[..., 1]], dim=-1)
+
+
+def _sharpen(picture: Tensor, strength: float) -> Tensor:
+    """Unsharp mask: symmetric, so a straight edge keeps its place."""
+    x = picture.movedim(-1, 1)
+    kernel = x.new_tensor([1.0, 4.0, 6.0, 4.0, 1.0]) / 16.0
+    blurred = F.pad(x, (2, 2, 2, 2), mode="replicate")
+    blurred = F.conv2d(blurred, kernel.view(1, 1, 1, 5).expand(3, 1, 1, 5), groups=3)
+    blurred = F.conv2d(blurred, kernel.view(1, 1, 5, 1).expand(3, 1, 5, 1), groups=3)
+    return (x + strength * (x - blurred)).movedim(1, -1).contiguous()
+
+
+def _mosaic(picture: Tensor) -> Tensor:
+    """Keep one colour a pixel (RGGB) and interpolate the others bilinearly."""
+    x = picture.movedim(-1, 1)
+    keep = torch.zeros((3, *x.shape[2:]), device=x.device)
+    keep[0, ::2, ::2] = keep[1, ::2, 1::2] = keep[1, 1::2, ::2] = keep[2, 1::2, 1::2] = 1.0
+    cross = x.new_tensor([[0.25, 0.5, 0.25], [0.5, 1.0, 0.5], [0.25, 0.5, 0.25]])
+    plus = x.new_tensor([[0.0, 0.25, 0.0], [0.25, 1.0, 0.25], [0.0, 0.25, 0.0]])
+    kernel = torch.stack([cross, plus, cross])[:, None]
+    # Mirrored about the border pixel, the pattern keeps its colours.
+    return F.conv2d(F.pad(x * keep, (1, 1, 1, 1), mode="reflect"), kernel, groups=3).movedim(1, -1).contiguous()
+
+
+def _jpeg(pictures: Tensor, quality: int) -> Tensor:
+    """Compress and decompress."""
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality]
+    decoded = []
+    for picture in pictures.cpu().numpy():
+        _, data = cv2.imencode(".jpg", picture[..., ::-1], options)
+        decoded.append(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1])
+    return torch.from_numpy(np.stack(decoded)).to(pictures.device)
