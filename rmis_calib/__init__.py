@@ -28,6 +28,7 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "evaluate": ".pipeline",
         "load_config": ".config",
         "load_recording": ".io",
+        "run_calibration": ".pipeline",
         "solve": ".pipeline",
     },
 )

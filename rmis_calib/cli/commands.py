@@ -233,18 +233,29 @@ def calibrate_folder(
 def render_recording(
     out: Path, preset: str, motions: int | None, seed: int | None, overwrite: bool, progress: ProgressCallback
 ) -> None:
-    """Render a preset of `configs/synth`, with another number of motions or another seed where given."""
-    import data_synth
-    from rmis_calib.io import config_path
+    """Render a preset of `configs/synth`, with another number of motions or another seed where given.
 
-    path = Path(preset) if preset.endswith((".yaml", ".yml")) else config_path("synth", preset)
+    Raises:
+        InputError: no such preset, or an impossible value in it.
+        OutputError: the folder exists already, or cannot be written.
+    """
+    import data_synth
+    from rmis_calib.errors import InputError, OutputError
+
     changes = {"motions": motions, "seed": seed}
-    config = replace(
-        data_synth.load_synth_config(path), **{key: value for key, value in changes.items() if value is not None}
-    )
-    data_synth.write_recording(
-        out, config, overwrite=overwrite, on_progress=lambda done, total: progress("rendering", done, total)
-    )
+    try:
+        config = data_synth.load_synth_config(preset)
+        config = replace(config, **{key: value for key, value in changes.items() if value is not None})
+    except (FileNotFoundError, ValueError) as error:
+        raise InputError(" ".join(str(error).split()), where="--preset") from error
+    try:
+        data_synth.write_recording(
+            out, config, overwrite=overwrite, on_progress=lambda done, total: progress("rendering", done, total)
+        )
+    except FileExistsError as error:
+        raise OutputError(where=str(out), expected="a new folder, or --overwrite", found="one that exists") from error
+    except OSError as error:
+        raise OutputError(where=str(out), expected="a place that can be written", found=error.strerror) from error
 
 
 def conclude(result: "CalibrationResult", written: Path) -> int:

@@ -74,7 +74,7 @@ def make_result(
         camera_right_T_arm=_transform("camera_right", "arm", solution.camera_right_T_arm) if finite else None,
         camera_left_T_camera_right=None if stereo is None else _transform("camera_left", "camera_right", stereo),
         covariance=covariance if np.isfinite(covariance).all() else None,
-        observability=observability_record(solution.observability[0]),
+        observability=observability_record(solution.observability()),
         motions=motions,
         residuals=residuals,
         nuisances=_nuisance_records(solution),
@@ -86,7 +86,7 @@ def make_result(
 def judge(solution: Solution) -> tuple[Status, str]:
     """Status and its one line: a solve that did not work first, then what the data can tell."""
     status = SolveStatus(int(solution.status))
-    observability = solution.observability[0]
+    observability = solution.observability()
     if status is not SolveStatus.CONVERGED:
         return "solver_failed", f"{STATUS_SENTENCES['solver_failed']}: {status.sentence}"
     names: dict[str, Status] = {"trustworthy": "ok", "weak": "weak", "unobservable": "unobservable"}

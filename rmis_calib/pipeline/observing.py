@@ -75,12 +75,25 @@ def predict_ends(camera_T_arm: Float[Tensor, "4 4"], poses: MotionPoses, offset_
 
 
 def assemble(
-    recording: Recording, poses: MotionPoses, views: tuple[View, ...], choices: tuple[Choice, ...]
+    recording: Recording,
+    poses: MotionPoses,
+    views: tuple[View, ...],
+    choices: tuple[Choice, ...],
+    model_sigma_px: float = 0.0,
 ) -> ShaftObservations:
-    """The solver's input, one motion a frame whose joints are known."""
+    """The solver's input, one motion a frame whose joints are known.
+
+    Args:
+        recording: cameras, shaft diameter and head points.
+        poses: kinematics of the motions.
+        views: detections of every frame.
+        choices: candidate of every motion, one entry a view.
+        model_sigma_px: added in quadrature to the sigma of every contour and end.
+    """
     arrays: dict[str, np.ndarray] = {}
     for view, choice in zip(views, choices, strict=True):
-        arrays |= _measured(view.side, select_frames(view.detections, poses.frames), choice)
+        floor = 0.0 if view.camera is None else model_sigma_px / float(view.camera.focal)
+        arrays |= _measured(view.side, select_frames(view.detections, poses.frames), choice, floor)
     extrinsics = recording.stereo.camera_left_T_camera_right
     return ShaftObservations(
         arm_T_rcm=poses.arm_T_rcm.cpu().numpy(),
@@ -129,10 +142,12 @@ def select_frames(detections: ShaftDetections, frames: np.ndarray) -> ShaftDetec
     return ShaftDetections(**{name: value[index] for name, value in vars(detections).items()})
 
 
-def _measured(side: str, detections: ShaftDetections, choice: Choice) -> dict[str, np.ndarray]:
+def _measured(side: str, detections: ShaftDetections, choice: Choice, floor: float) -> dict[str, np.ndarray]:
+    """The chosen candidates as arrays of DESIGN.md 6.2; `floor` is the least sigma, normalised units."""
     rows = torch.arange(len(choice.candidate), device=choice.candidate.device)
     best = choice.candidate.clamp_min(0)
     turned = choice.reversed
+    least = torch.tensor(floor, dtype=torch.float64, device=turned.device)
 
     def pick(name: str) -> Tensor:
         value = getattr(detections, name)[rows, best]
@@ -148,11 +163,11 @@ def _measured(side: str, detections: ShaftDetections, choice: Choice) -> dict[st
     has_end = choice.taken & pick("end_valid") & ~turned
     return {
         f"axis_{side}": known(axis, choice.taken),
-        f"sigma_axis_{side}": known(pick("axis_sigma"), choice.taken),
+        f"sigma_axis_{side}": known(pick("axis_sigma").hypot(least / 2**0.5), choice.taken),
         f"contour_{side}": known(contour, choice.taken),
-        f"sigma_contour_{side}": known(sigma, choice.taken),
+        f"sigma_contour_{side}": known(sigma.hypot(least), choice.taken),
         f"end_{side}": known(pick("end_xy"), has_end),
-        f"sigma_end_{side}": known(pick("end_sigma"), has_end),
+        f"sigma_end_{side}": known(pick("end_sigma").hypot(least), has_end),
         f"valid_{side}": choice.taken.cpu().numpy(),
     }
 
