@@ -16,6 +16,7 @@ from rmis_calib.solver.normal import NoiseModel
 from rmis_calib.solver.observability import Sight, look, recognise
 from rmis_calib.solver.paper import average, empirical_covariance, influence, solve_paper
 from rmis_calib.solver.problem import MIN_MOTIONS, Problem
+from rmis_calib.solver.relinearise import Kinematics, solve_relinearised
 from rmis_calib.solver.residuals import State, residual_rows
 from rmis_calib.solver.settings import SolverSettings
 from rmis_calib.solver.solution import MotionReason, Nuisance, Solution, SolveStatus
@@ -26,13 +27,16 @@ from rmis_calib.solver.variance import assumed_noise
 MIN_CHEIRALITY = 0.5
 
 
-def solve(problem: Problem, settings: SolverSettings | None = None, method: str | None = None) -> Solution:
+def solve(
+    problem: Problem, settings: SolverSettings | None = None, method: str | None = None, kinematics: Kinematics | None = None
+) -> Solution:
     """Estimates `camera_right_T_arm` of every trial.
 
     Args:
         problem: any leading trial batch.
         settings: defaults when absent.
         method: overrides the settings' method.
+        kinematics: evaluates both arms at joint and clock offsets (relinearise.py); with it, `joint` iterates on them.
 
     Raises:
         ObservationsError: values that are not finite where they must be, or rotations that are not rotations.
@@ -43,7 +47,8 @@ def solve(problem: Problem, settings: SolverSettings | None = None, method: str 
     flat = problem.flatten_batch()
     _check(flat)
     if method == "joint":
-        return _shaped(_joint_solution(flat, solve_joint(flat, settings), settings), problem.batch_shape)
+        fit = solve_joint(flat, settings) if kinematics is None else solve_relinearised(flat, settings, kinematics)
+        return _shaped(_joint_solution(fit, settings), problem.batch_shape)
     statistics = LineStatistics.from_problem(flat)
     if bool((statistics.count.sum(-1) < MIN_MOTIONS).any()):
         raise InsufficientDataError(where="axis lines", expected=f"at least {MIN_MOTIONS}", found=int(statistics.count.sum(-1).min()))
@@ -99,7 +104,7 @@ def _two_step_solution(flat: Problem, R: Tensor, t: Tensor, covariance: Tensor, 
     )
 
 
-def _joint_solution(flat: Problem, fit: JointFit, settings: SolverSettings) -> Solution:
+def _joint_solution(fit: JointFit, settings: SolverSettings) -> Solution:
     """Solution of the joint estimate."""
     packed, state = fit.packed, fit.state
     C = fit.covariance[:, :6, :6]
@@ -132,7 +137,7 @@ def _joint_solution(flat: Problem, fit: JointFit, settings: SolverSettings) -> S
         nuisances=_nuisances(fit, settings),
         bias=fit.bias[:, :6],
         history=fit.history,
-        sight=_sight(flat, state.R, state.t, C, fit.noise, (packed.has_contours, packed.has_ends, packed.has_heads), settings),
+        sight=_sight(fit.problem, state.R, state.t, C, fit.noise, (packed.has_contours, packed.has_ends, packed.has_heads), settings),
         **_residuals(packed, state),
     )
 
@@ -181,7 +186,7 @@ def _shaped(solution: Solution, batch: torch.Size) -> Solution:
 
     def shaped(value: Any) -> Any:
         if isinstance(value, Tensor):
-            return value.reshape(*batch, *value.shape[1:])
+            return value.reshape((*batch, *value.shape[1:]))
         if isinstance(value, dict):
             return {key: shaped(item) for key, item in value.items()}
         if isinstance(value, Nuisance):

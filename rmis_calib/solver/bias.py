@@ -110,11 +110,11 @@ def expected_score(
     generator = torch.Generator(device=packed.p.device).manual_seed(seed)
     n, b = packed.motions, packed.trials
     wanted = max(simulated_motions, n // 4)
-    stride = max(1, n // wanted)
     repeats = max(1, -(-wanted // n))
-    order = torch.randperm(n, generator=generator, device=packed.p.device)[: -(-n // stride)]
-    picked = packed if stride == 1 else packed.take_motions(order)
-    picked_weight = weight if stride == 1 or weight is None else weight[..., order]
+    picked, picked_weight = packed, weight
+    if wanted < n:
+        order = torch.randperm(n, generator=generator, device=packed.p.device)[:wanted]
+        picked, picked_weight = packed.take_motions(order), None if weight is None else weight[..., order]
     m = picked.motions
     step_n, step_b = min(m, chunk), max(1, chunk // min(m, chunk))
     g, H = torch.zeros_like(layout.sigma), torch.zeros(b, layout.size, layout.size, dtype=packed.p.dtype, device=packed.p.device)

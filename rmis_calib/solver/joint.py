@@ -25,9 +25,13 @@ START_ITERATIONS = 12
 START_TOLERANCE = 0.1
 """Starts are compared, not reported: a tenth of a standard error of the sample is enough."""
 COMPETING_MINIMA = 4
-SAMPLE_MOTIONS = 1024
+SETTLED_FIT = 1.5
+"""Chi^2 per row up to which the first start needs no competition..."""
+SURE_RAD = 0.02
+"""...if its own sample fixes the rotation this well (1.1 degrees)."""
+SAMPLE_MOTIONS = 512
 """Motions on which outliers are annealed and noise levels estimated; all motions are classified afterwards."""
-NOISE_ROUNDS = 3
+NOISE_ROUNDS = 2
 MAX_PASSES = 12
 INFORMATION_FLOOR = 0.05
 """Least part of the raw information that the bias correction leaves in any direction. Where it would leave less, nearly all the information is noise in
@@ -38,6 +42,7 @@ the Jacobian; sigma is then reported at least 4.5 times the raw one, which no ve
 class JointFit:
     """Estimate of a flat batch, before it is put into words."""
 
+    problem: Problem
     packed: Packed
     state: State
     layout: Layout
@@ -54,8 +59,13 @@ class JointFit:
     history: tuple[Tensor, ...]
 
 
-def solve_joint(problem: Problem, settings: SolverSettings) -> JointFit:
+def solve_joint(problem: Problem, settings: SolverSettings, start: "JointFit | None" = None) -> JointFit:
     """Joint estimate of a problem with one trial axis.
+
+    Args:
+        problem: motions and measurements.
+        settings: everything else.
+        start: an estimate nearby, which takes the place of the competition of starts.
 
     Raises:
         InsufficientDataError: fewer measured rows than unknowns in some trial.
@@ -64,8 +74,13 @@ def solve_joint(problem: Problem, settings: SolverSettings) -> JointFit:
     assumed, free = assumed_noise(problem, settings.noise)
     generator = torch.Generator().manual_seed(settings.seed)
     order = torch.randperm(packed.motions, generator=generator).to(packed.p.device)
-    state, noise, contaminated = _compete(problem, packed, order, assumed, free, settings)
-    layout = make_layout(problem, packed, initial_state(problem, state.R, state.t), settings.unknowns, settings.noise)
+    if start is None:
+        state, noise, contaminated = _compete(problem, packed, order, assumed, free, settings)
+    else:
+        state, noise, contaminated = start.state, start.noise, False
+    fresh = initial_state(problem, state.R, state.t)
+    layout = make_layout(problem, packed, fresh, settings.unknowns, settings.noise)
+    state = fresh if start is not None else state
     _check_rows(packed, layout)
     sample = packed.take_motions(order[:SAMPLE_MOTIONS]) if packed.motions > SAMPLE_MOTIONS else packed
     weight = None
@@ -78,16 +93,15 @@ def solve_joint(problem: Problem, settings: SolverSettings) -> JointFit:
     if contaminated or settings.robust == "on":
         weight = _classify(packed, state, noise, settings.outlier_probability)
     refined = polish(packed, state, layout, noise, settings.tolerance_sigma, MAX_PASSES, settings.chunk, weight)
-    if settings.robust != "off":
-        distance2, rows = _distances(packed, refined.state, noise, settings.chunk)
-        if bool((distance2 > chi2_quantile(rows, settings.outlier_probability)).any()):
-            weight = inlier_weight(distance2, rows, settings.outlier_probability)
-            refined = polish(packed, refined.state, layout, noise, settings.tolerance_sigma, MAX_PASSES, settings.chunk, weight)
-    return _finish(packed, refined, layout, noise, weight, settings)
+    distance2, rows = _distances(packed, refined.state, noise, settings.chunk)
+    if settings.robust != "off" and bool((distance2 > chi2_quantile(rows, settings.outlier_probability)).any()):
+        weight = inlier_weight(distance2, rows, settings.outlier_probability)
+        refined = polish(packed, refined.state, layout, noise, settings.tolerance_sigma, MAX_PASSES, settings.chunk, weight)
+    return _finish(problem, packed, refined, layout, noise, weight, distance2, settings)
 
 
 def _finish(
-    packed: Packed, refined: Refined, layout: Layout, noise: NoiseModel, weight: Tensor | None, settings: SolverSettings
+    problem: Problem, packed: Packed, refined: Refined, layout: Layout, noise: NoiseModel, weight: Tensor | None, distance2: Tensor, settings: SolverSettings
 ) -> JointFit:
     """Bias correction, covariance, and what every motion contributed."""
     state, normal = refined.state, refined.normal
@@ -100,10 +114,10 @@ def _finish(
         prior = with_prior(replace(normal, H=torch.zeros_like(normal.H)), layout, state).H
         information = floored_information(normal.H - prior, expected.H) + prior
     weight_all = torch.ones_like(packed.line_ok[0], dtype=packed.p.dtype) if weight is None else weight
-    distance2, _ = _distances(packed, state, noise, settings.chunk)
     scale = information.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
     inverse = torch.linalg.pinv(information * scale[:, :, None] * scale[:, None], hermitian=True, rtol=1e-15)
     return JointFit(
+        problem=problem,
         packed=packed,
         state=state,
         layout=layout,
@@ -156,8 +170,12 @@ def _compete(
     index = order[: settings.start_motions]
     sample = packed.take_motions(index)
     R, t = _starts(problem, packed, settings)
-    state, noise, outliers = _race(problem, sample, R, t, assumed, free, settings, robust=False)
-    if settings.robust == "off" or not (outliers or settings.robust == "on"):
+    first = _race(problem, sample, R[:, :1], t[:, :1], assumed, free, settings, robust=False)
+    if first.settled:
+        return first.state, first.noise, False
+    race = _race(problem, sample, R, t, assumed, free, settings, robust=False)
+    state, noise = race.state, race.noise
+    if settings.robust == "off" or not (race.outliers or settings.robust == "on"):
         return state, noise, False
     sub = problem.select_motions(index)
     candidates = robust_candidates(sub, settings.grid, COMPETING_MINIMA)
@@ -165,8 +183,18 @@ def _compete(
     if packed.has_contours:
         R, t = contour_starts(sample, torch.nan_to_num(problem.radius_mm), reweightings=10)
         starts_R, starts_t = [*starts_R, R], [*starts_t, t]
-    state, noise, _ = _race(problem, sample, torch.cat(starts_R, 1), torch.cat(starts_t, 1), assumed, free, settings, robust=True)
-    return state, noise, True
+    race = _race(problem, sample, torch.cat(starts_R, 1), torch.cat(starts_t, 1), assumed, free, settings, robust=True)
+    return race.state, race.noise, True
+
+
+@dataclass(frozen=True)
+class _Race:
+    """Winner of a race of starts: state and noise levels per trial; whether any trial has outliers; whether no other start needs to be tried."""
+
+    state: State
+    noise: NoiseModel
+    outliers: bool
+    settled: bool
 
 
 def _starts(problem: Problem, packed: Packed, settings: SolverSettings) -> tuple[Float[Tensor, "b s 3 3"], Float[Tensor, "b s 3"]]:
@@ -190,10 +218,10 @@ def _race(
     free: dict[str, Tensor],
     settings: SolverSettings,
     robust: bool,
-) -> tuple[State, NoiseModel, bool]:
+) -> _Race:
     """Refines every start on the sample and keeps, per trial, the one of least truncated cost among those in front of the camera."""
     b, s = R.shape[:2]
-    states, costs = [], []
+    states, kept = [], []
     step = max(1, settings.chunk // (s * sample.motions))
     for start in range(0, b, step):
         part = slice(start, min(start + step, b))
@@ -214,26 +242,39 @@ def _race(
         best = (torch.nan_to_num(cost.view(-1, s), nan=1e29) + torch.where(enough, 0.0, 1e30)).argmin(1)
         flat = best + s * torch.arange(best.shape[0], device=best.device)
         states.append(refined.state.take(flat))
-        costs.append((distance2[:, flat], rows[:, flat]))
+        kept.append((distance2[:, flat], rows[:, flat], front.flatten()[flat], _sure(refined.normal.H[flat])))
     state = State(**{name: torch.cat([getattr(part, name) for part in states]) for name in vars(states[0])})
-    distance2, rows = torch.cat([c[0] for c in costs], dim=1), torch.cat([c[1] for c in costs], dim=1)
+    distance2, rows = (torch.cat([part[i] for part in kept], dim=1) for i in (0, 1))
+    front, sure = (torch.cat([part[i] for part in kept]) for i in (2, 3))
     noise = _inflated(assumed, free, distance2, rows)
-    limit = chi2_quantile(rows, settings.outlier_probability) * _inflation(distance2, rows)[:, None] if _any(free) else chi2_quantile(rows, settings.outlier_probability)
-    exceeding = ((distance2 > 2.0 * limit) & (rows > 0)).sum((0, 2))
-    return state, noise, bool((exceeding > 0).any())
+    limit = chi2_quantile(rows, settings.outlier_probability)
+    if _any(free):
+        limit = limit * _inflation(distance2, rows)[:, None]
+    outliers = bool(((distance2 > 2.0 * limit) & (rows > 0)).any())
+    fits = distance2.sum((0, 2)) < SETTLED_FIT * rows.sum((0, 2))
+    return _Race(state, noise, outliers, bool((fits & (front > 0.9) & sure).all()) and not outliers)
+
+
+def _sure(H: Float[Tensor, "b p p"]) -> Bool[Tensor, " b"]:
+    """Whether the sample alone fixes the rotation to SURE_RAD: then no second minimum fits as well."""
+    covariance = torch.linalg.pinv(torch.nan_to_num(H), hermitian=True)
+    return covariance[:, :3, :3].diagonal(dim1=-2, dim2=-1).sum(-1) < SURE_RAD**2
 
 
 def _take_trials(problem: Problem, part: slice, times: int) -> Problem:
     """The small per-trial tensors of a problem for some trials, each repeated; the motions stay behind."""
     cameras = problem.camera_T_camera_right[part].repeat_interleave(times, 0)
     noise = type(problem.noise)(**{k: v[part].repeat_interleave(times) for k, v in vars(problem.noise).items()})
-    sigma = problem.joint_offset_sigma
+    small = {
+        name: None if (value := getattr(problem, name)) is None else value[part].repeat_interleave(times, 0)
+        for name in ("joint_offset_sigma", "joint_offset_at", "clock_at")
+    }
     return replace(
         problem,
         camera_T_camera_right=cameras,
         radius_mm=problem.radius_mm[part].repeat_interleave(times),
         noise=noise,
-        joint_offset_sigma=None if sigma is None else sigma[part].repeat_interleave(times, 0),
+        **small,
     )
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rmis_calib.solver.measurements import END, HEAD, LINE, Packed
-from rmis_calib.solver.residuals import Rows, State, linearise
+from rmis_calib.solver.residuals import State, linearise
 from rmis_calib.solver.soa import eliminate, forward_substitute
 from rmis_calib.solver.unknowns import Layout, columns
 
@@ -67,27 +67,41 @@ def image_variance(packed: Packed, noise: NoiseModel) -> Float[Tensor, "k b n"]:
     return torch.where(packed.rows_ok, packed.rows_var * scale[:, :, None], 1.0)
 
 
-def covariance(packed: Packed, rows: Rows, noise: NoiseModel, out: Tensor, weight: Tensor | None = None) -> None:
-    """Writes S into `out` (k, k, b, n). With a weight per camera and motion, that camera's block is inflated by 1/weight."""
-    for name, vectors in (("mm", rows.w), ("rad", rows.a)):
-        gram = out if name == "mm" else torch.empty_like(out)
-        torch.mul(vectors[0, :, None], vectors[0, None], out=gram)
+def covariance(
+    w: Float[Tensor, "3 k b n"],
+    a: Float[Tensor, "3 k b n"],
+    image: Float[Tensor, "k b n"],
+    cameras: tuple[int, ...],
+    noise: NoiseModel,
+    out: Float[Tensor, "k k b n"],
+    weight: Float[Tensor, "c b n"] | None = None,
+) -> None:
+    """Writes S into `out`. With a weight per camera and motion, that camera's block is inflated by 1/weight.
+
+    Args:
+        w, a: effects of a translation and a rotation of the shaft on each row (`residuals.Rows`).
+        image: D.
+        cameras: camera of each row.
+    """
+    index = torch.tensor(cameras, device=out.device)
+    same = (index[:, None] == index[None]).to(out.dtype)[:, :, None, None]
+    seen_apart = bool((noise.camera_mm > 0).any()) or bool((noise.camera_rad > 0).any())
+    several = len(set(cameras)) > 1
+    scratch = torch.empty_like(out)
+    for vectors, shared, own, gram in (
+        (w, noise.kinematics_mm, noise.camera_mm, out),
+        (a, noise.kinematics_rad, noise.camera_rad, scratch),
+    ):
+        scaled = vectors * (shared if seen_apart and several else shared + own)[:, None]
+        torch.mul(scaled[0, :, None], vectors[0, None], out=gram)
         for i in (1, 2):
-            gram.addcmul_(vectors[i, :, None], vectors[i, None])
-        kinematics, camera = getattr(noise, f"kinematics_{name}"), getattr(noise, f"camera_{name}")
-        if bool((camera > 0).any()) and packed.cameras > 1:
-            cameras = torch.tensor(packed.row_camera, device=out.device)
-            same = (cameras[:, None] == cameras[None]).to(out.dtype)
-            gram.mul_(kinematics[:, None] + same[:, :, None, None] * camera[:, None])
-        else:
-            gram.mul_((kinematics + camera)[:, None])
-        if name == "rad":
-            out.add_(gram)
-    out.diagonal(dim1=0, dim2=1).add_(image_variance(packed, noise).permute(1, 2, 0))
+            gram.addcmul_(scaled[i, :, None], vectors[i, None])
+        if seen_apart and several:
+            gram.mul_(1.0 + same * (own / shared.clamp_min(1e-300))[:, None])
+    out.add_(scratch)
+    out.diagonal(dim1=0, dim2=1).add_(image.permute(1, 2, 0))
     if weight is not None:
-        cameras = torch.tensor(packed.row_camera, device=out.device)
-        same = (cameras[:, None] == cameras[None]).to(out.dtype)[:, :, None, None]
-        out.mul_(1.0 + same * (1.0 / weight[cameras] - 1.0)[:, None])
+        out.mul_(1.0 + same * (1.0 / weight[index] - 1.0)[:, None])
 
 
 def normal_equations(
@@ -103,7 +117,7 @@ def normal_equations(
     k, b, n = rows.r.shape
     p = layout.size
     augmented = torch.empty((k, k + p + 1, b, n), dtype=rows.r.dtype, device=rows.r.device)
-    covariance(packed, rows, noise, augmented[:, :k], weight)
+    covariance(rows.w, rows.a, image_variance(packed, noise), packed.row_camera, noise, augmented[:, :k], weight)
     augmented[:, k:-1] = columns(layout, rows, shaft, packed, state)
     augmented[:, -1] = rows.r
     eliminate(augmented)
@@ -172,13 +186,15 @@ def camera_distance2(
 ) -> tuple[Float[Tensor, "c b n"], Float[Tensor, "c b n"]]:
     """Mahalanobis distance^2 of each camera's measurements of a motion on their own, and how many rows they are."""
     rows, _ = linearise(packed, state)
-    cameras = torch.tensor(packed.row_camera, device=rows.r.device)
-    full = torch.empty((len(cameras),) * 2 + rows.r.shape[1:], dtype=rows.r.dtype, device=rows.r.device)
-    covariance(packed, rows, noise, full)
+    image = image_variance(packed, noise)
     distances, counts = [], []
     for c in range(packed.cameras):
-        mine = torch.nonzero(cameras == c)[:, 0]
-        system = eliminate(torch.cat((full[mine][:, mine], rows.r[mine][:, None]), dim=1))
+        mine = torch.tensor([i for i, camera in enumerate(packed.row_camera) if camera == c], device=rows.r.device)
+        k = len(mine)
+        system = torch.empty((k, k + 1, *rows.r.shape[1:]), dtype=rows.r.dtype, device=rows.r.device)
+        covariance(rows.w[:, mine], rows.a[:, mine], image[mine], (c,) * k, noise, system[:, :k])
+        system[:, k] = rows.r[mine]
+        eliminate(system)
         pivots = system.diagonal(dim1=0, dim2=1).permute(2, 0, 1)
         distances.append((system[:, -1].square() / pivots).sum(0))
         counts.append(packed.rows_ok[mine].sum(0).to(rows.r.dtype))

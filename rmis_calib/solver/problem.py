@@ -67,6 +67,8 @@ class Problem:
             v x dv, a change of the insertion as v ds.
         joint_offset_sigma: prior of each joint's offset, in its unit.
         clock_derivative: the same displacement per second of clock offset, [motion, 6].
+        joint_offset_at: joint offsets at which the kinematics here were evaluated; None: zero.
+        clock_at: clock offset, s, likewise.
     """
 
     arm_T_rcm: Float[Tensor, "*batch n 4 4"]
@@ -88,6 +90,8 @@ class Problem:
     joint_derivative: Float[Tensor, "*batch n 6 j"] | None = None
     joint_offset_sigma: Float[Tensor, "*batch j"] | None = None
     clock_derivative: Float[Tensor, "*batch n 6"] | None = None
+    joint_offset_at: Float[Tensor, "*batch j"] | None = None
+    clock_at: Float[Tensor, "*batch"] | None = None
 
     @property
     def batch_shape(self) -> torch.Size:
@@ -133,7 +137,7 @@ class Problem:
     def _map_motions(self, function: Any) -> "Problem":
         k = len(self.batch_shape)
         after_camera = {"axis_xy", "axis_sigma", "contour_xy", "contour_sigma", "end_xy", "end_sigma", "head_xy", "head_sigma", "valid"}
-        constant = {"camera_T_camera_right", "radius_mm", "joint_offset_sigma"}
+        constant = {"camera_T_camera_right", "radius_mm", "joint_offset_sigma", "joint_offset_at", "clock_at"}
         changed = {}
         for field in fields(self):
             value = getattr(self, field.name)

@@ -69,13 +69,13 @@ class VerdictSettings:
 
     working_point_mm: tuple[float, float, float] | None = None
     """Point in the right camera's frame at which the error counts; default: the mean measured shaft end or head point."""
-    trustworthy_mm: Positive = 2.0
+    trustworthy_mm: Positive = 4.0
     """Predicted error at the working point below which the result is `trustworthy`."""
-    unobservable_mm: Positive = 6.0
+    unobservable_mm: Positive = 12.0
     """Predicted error above which the transform is `unobservable`; between the two it is `weak`."""
-    trustworthy_deg: Positive = 1.5
+    trustworthy_deg: Positive = 2.0
     """Predicted rotation error below which the result is `trustworthy`."""
-    unobservable_deg: Positive = 6.0
+    unobservable_deg: Positive = 8.0
     """Predicted rotation error above which it is `unobservable`."""
     lever_mm: Positive = 50.0
     """Length that turns a rotation into a displacement when directions are ranked: about the visible part of the shaft."""
@@ -99,8 +99,9 @@ class SolverSettings:
     """Chance of rejecting a good measurement (of one camera in one motion)."""
     bias_correction: bool = True
     """Subtract the second-order bias of errors in variables, from antithetic simulations at the estimate."""
-    bias_motions: Count = 4096
-    """Simulated motions that the bias is averaged over; more than N repeats motions with other noise."""
+    bias_motions: Count = 512
+    """Least number of simulated pairs that the bias is averaged over (a quarter of the motions where that is more). Antithetic pairs know it from 512 to
+    a few per cent of sigma at realistic noise."""
     grid: Annotated[int, Field(ge=24, le=20000)] = 576
     """Rotations of the covering grid."""
     minima: Annotated[int, Field(ge=1, le=64)] = 8
@@ -109,7 +110,7 @@ class SolverSettings:
     """Steps of each refinement."""
     tolerance_sigma: Positive = 1e-3
     """Converged when the proposed step is below this part of the standard error in every direction: step^T H step < tolerance^2."""
-    start_motions: Count = 256
+    start_motions: Count = 96
     """Motions that the starts compete on; all motions refine the winner."""
     thin_to: Count | None = None
     """Keep only this many most informative motions (D-optimal); the loss in information is stated."""

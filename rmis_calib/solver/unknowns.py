@@ -1,12 +1,11 @@
 """Which parameters a joint estimate has, their priors, and their columns of the Jacobian."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rmis_calib.geometry.rotations import matrix_to_rotvec
 from rmis_calib.solver.measurements import Packed
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.residuals import Rows, Shaft, State, rcm_axes
@@ -25,13 +24,18 @@ UNITS = {
 """Unit of each nuisance block."""
 
 
+TRANSLATION_SIGMA_MM = 2000.0
+"""Prior of the hand-eye translation about zero: no arm is longer. It moves a translation of 200 mm known to 1 mm by 5e-5 mm, and keeps one that the data
+cannot see within the operating theatre."""
+
+
 @dataclass(frozen=True)
 class Layout:
     """Blocks of the parameter vector, with the priors.
 
     Attributes:
         blocks: name -> slice; `rotation` and `translation` of the hand-eye transform come first.
-        sigma: prior 1 sigma of every parameter; infinite for the hand-eye transform.
+        sigma: prior 1 sigma of every parameter; infinite for the hand-eye rotation.
         origin: state that the priors are centred on.
     """
 
@@ -51,14 +55,17 @@ class Layout:
         return Layout(self.blocks, self.sigma[index], self.origin.take(index))
 
     def prior(self, state: State) -> tuple[Float[Tensor, "b p"], Float[Tensor, "b p"]]:
-        """Deviation of the state from the priors' centre, and their weights 1/sigma^2."""
+        """Deviation of the state from the priors' centre, and their weights 1/sigma^2.
+
+        The stereo rotation's deviation is the vector of (R - R^T)/2, its sine: within 1e-5 of the angle up to half a degree.
+        """
         zero, origin = torch.zeros_like(state.t), self.origin
         turned = origin.stereo_R.mT @ state.stereo_R
         shifted = (origin.stereo_R.mT @ (state.stereo_t - origin.stereo_t)[..., None])[..., 0]
         deviation = {
             "rotation": zero,
-            "translation": zero,
-            "stereo_rotation": matrix_to_rotvec(turned) if "stereo_rotation" in self.blocks else zero,
+            "translation": state.t,
+            "stereo_rotation": 0.5 * torch.stack([turned[:, i, j] - turned[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], dim=-1),
             "stereo_translation": shifted,
             "radius": (state.radius - origin.radius)[:, None],
             "end_offset": (state.end_offset - origin.end_offset)[:, None],
@@ -87,13 +94,21 @@ def initial_state(problem: Problem, R: Float[Tensor, "b 3 3"], t: Float[Tensor, 
     )
 
 
+def prior_centre(problem: Problem, state: State) -> State:
+    """State that the priors are centred on. Offsets of a state count from where the kinematics were evaluated, priors from zero."""
+    joints = -problem.joint_offset_at if problem.joint_offset_at is not None else torch.zeros_like(state.joint_offset)
+    clock = -problem.clock_at if problem.clock_at is not None else torch.zeros_like(state.clock)
+    return replace(state, joint_offset=joints, clock=clock)
+
+
 def make_layout(problem: Problem, packed: Packed, origin: State, settings: UnknownSettings, noise: NoiseSettings) -> Layout:
     """The parameters that the settings ask for and the measurements can carry."""
     b, like = origin.t.shape[0], origin.t
     stereo_rad = torch.nan_to_num(problem.noise.stereo_rad, nan=noise.stereo_deg * torch.pi / 180.0)
     stereo_mm = torch.nan_to_num(problem.noise.stereo_mm, nan=noise.stereo_mm)
     infinite = torch.full_like(like[:, 0], torch.inf)
-    entries: list[tuple[str, int, Tensor]] = [("rotation", 3, infinite), ("translation", 3, infinite)]
+    far = torch.full_like(infinite, TRANSLATION_SIGMA_MM)
+    entries: list[tuple[str, int, Tensor]] = [("rotation", 3, infinite), ("translation", 3, far)]
     if settings.stereo and packed.cameras == 2:
         entries += [("stereo_rotation", 3, stereo_rad), ("stereo_translation", 3, stereo_mm)]
     if settings.radius and packed.has_contours:
@@ -112,7 +127,7 @@ def make_layout(problem: Problem, packed: Packed, origin: State, settings: Unkno
         blocks[name] = slice(start, start + width)
         sigmas.append(sigma if sigma.ndim == 2 else sigma[:, None].expand(b, width))
         start += width
-    return Layout(blocks, torch.cat(sigmas, dim=-1).clamp_min(1e-12), origin)
+    return Layout(blocks, torch.cat(sigmas, dim=-1).clamp_min(1e-12), prior_centre(problem, origin))
 
 
 def columns(layout: Layout, rows: Rows, shaft: Shaft, packed: Packed, state: State) -> Float[Tensor, "k p b n"]:

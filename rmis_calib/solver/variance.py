@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rmis_calib.solver.measurements import END, HEAD, LINE, Packed
-from rmis_calib.solver.normal import NoiseModel, covariance
+from rmis_calib.solver.normal import NoiseModel, covariance, image_variance
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.residuals import Rows, State, linearise
 from rmis_calib.solver.settings import NoiseSettings
@@ -25,7 +25,9 @@ from rmis_calib.solver.unknowns import Layout, columns
 
 COMPONENTS = ("line", "end", "head", "kinematics_mm", "kinematics_rad")
 MAX_LOG_STEP = 1.5
-SCORING_STEPS = 4
+SCORING_STEPS = 5
+SETTLED = 0.02
+"""Scoring ends when no level moves by more than this part."""
 
 
 def assumed_noise(problem: Problem, settings: NoiseSettings) -> tuple[NoiseModel, dict[str, Tensor]]:
@@ -80,6 +82,8 @@ def estimate_components(
         step = torch.linalg.solve(fisher, torch.where(fixed, 0.0, score)[..., None])[..., 0].clamp(-MAX_LOG_STEP, MAX_LOG_STEP)
         moved = torch.where(fixed, v, (theta + step).exp())
         noise = replace(noise, **{name: moved[:, i] for i, name in enumerate(COMPONENTS)})
+        if not bool((torch.where(fixed, 0.0, step).abs() > SETTLED).any()):
+            break
     return noise
 
 
@@ -106,7 +110,7 @@ def _score(
     """Score with respect to each variance, and the Fisher information."""
     k, b, n = rows.r.shape
     S = torch.empty((k, k, b, n), dtype=r.dtype, device=r.device)
-    covariance(packed, rows, noise, S)
+    covariance(rows.w, rows.a, image_variance(packed, noise), packed.row_camera, noise, S)
     inverse = torch.linalg.inv(S.permute(2, 3, 0, 1))
     a, B = inverse @ r, inverse @ J
     H = (J.mT @ B).sum(1) + torch.diag_embed(layout.sigma.square().reciprocal())
