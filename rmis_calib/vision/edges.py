@@ -18,8 +18,8 @@ from rmis_calib.vision.strips import Strips
 
 # Blurs tried, in steps of the profile: from sharper than a pixel to soft motion blur.
 _BLURS = (0.5, 0.7, 0.95, 1.3, 1.8, 2.5, 3.4)
-# Prior on the slope of either side, in step heights a profile step: shading changes by less than a tenth of the contrast.
-_SLOPE_PRIOR = 0.05
+# Ridge on the two slopes: enough to keep the system regular where a contour is flat, too little to bias its place.
+_SLOPE_RIDGE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,10 +161,10 @@ def _step_columns(offsets: Float[Tensor, " d"], blur: Float[Tensor, "*b"]) -> Fl
 def step_estimator(offsets: Float[Tensor, " d"], blur: Float[Tensor, "*b"]) -> Float[Tensor, "*b 5 d"]:
     """Least-squares solution as a matrix, with a weak prior that slopes are small and a window around the step."""
     columns = _step_columns(offsets, blur)
-    reach = (3.0 * blur + 1.5)[..., None]
+    reach = (2.5 * blur + 1.0)[..., None]
     window = torch.exp(-0.5 * (offsets / reach) ** 4)[..., None]
     weighted = (columns * window).mT
-    prior = torch.diag(offsets.new_tensor([0.0, 0.0, 0.0, 1.0, 1.0])) * 0.5
+    prior = torch.diag(offsets.new_tensor([0.0, 0.0, 0.0, 1.0, 1.0])) * _SLOPE_RIDGE
     return torch.linalg.solve(weighted @ columns + prior, weighted)
 
 

@@ -11,11 +11,11 @@ from rmis_calib.vision.lens import Lens
 from rmis_calib.vision.sampling import inside, sample
 from rmis_calib.vision.strips import Strips
 
-_ROWS = 7
+_ROWS = 11
+_REACH = 0.5
+"""Rows lie within this share of the half width: beyond, the rim bends away and the shading of the limb begins."""
 _HALF = 40
-_FIT = 6
-_BLUR_STEPS = 1.3
-"""Blur assumed when the end is located, in profile steps; a wrong blur costs precision, not truth: the step is odd."""
+_FIT = 7
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,28 +33,29 @@ def locate(
     strips: Strips,
     coarse_t: Float[Tensor, "b k"],
     width: Float[Tensor, "b k"],
+    blur_px: Float[Tensor, "b k"],
     floor_px: float,
 ) -> ShaftEnd:
     """First strong change of colour met when walking along the shaft towards the tip, near the coarse end.
 
-    The boundary is an arc of an ellipse in the picture; over the middle third of the width it strays from its place on
-    the axis by less than two per cent of its own depth.
+    The boundary is an arc of an ellipse in the picture: its place is measured on rows across the middle half of the
+    width, and read on the axis from a parabola through them.
     """
     step = (0.9 * width / _HALF).clamp(0.5, 3.0)
     offsets = torch.arange(-_HALF, _HALF + 1, device=width.device, dtype=width.dtype)
     t = coarse_t[..., None] + offsets * step[..., None]  # (b, k, n)
     contour = strips.contour(t)
-    rows = torch.linspace(-1 / 6, 1 / 6, _ROWS, device=t.device)
+    rows = torch.linspace(-0.5 * _REACH, 0.5 * _REACH, _ROWS, device=t.device)
     y = contour.mean(2)[:, :, None] + (contour[:, :, 0] - contour[:, :, 1])[:, :, None] * rows[:, None]
     raw = lens.to_raw(strips.points(t[:, :, None].expand_as(y), y))  # (b, k, rows, n, 2)
     seen = inside(raw, (image.shape[-2], image.shape[-1])).all(2)
     colours = sample(image, raw)
     profile = _separate(colours, seen)
     index, rise, found = _first_rise(profile.mean(2), seen)
-    shift, agreement = _refine(profile, index)
+    shift, agreement = _refine(profile, index, (blur_px / step).clamp(0.5, 3.0))
     place = index.to(t.dtype) - _HALF + shift
     sigma = (agreement * step).clamp(min=floor_px)
-    sharp = (agreement < 3.0) & (rise > 0.02) & (shift.abs() < 3.0)
+    sharp = (agreement < 3.0) & (rise > 0.02) & (shift.abs() < 6.0)
     return ShaftEnd(coarse_t + place * step, sigma, found & sharp & strips.valid)
 
 
@@ -84,19 +85,43 @@ def _first_rise(
     return index, top - base, held.any(-1) & (seen.sum(-1) > 2 * third)
 
 
-def _refine(profile: Float[Tensor, "b k r n"], index: Tensor) -> tuple[Float[Tensor, "b k"], Float[Tensor, "b k"]]:
-    """Mean place of the step over the rows, in samples from `index`, and its standard deviation."""
+def _refine(
+    profile: Float[Tensor, "b k r n"], index: Tensor, blur_steps: Float[Tensor, "b k"]
+) -> tuple[Float[Tensor, "b k"], Float[Tensor, "b k"]]:
+    """Place of the step on the axis, in samples from `index`, and its standard deviation."""
     offsets = torch.arange(-_FIT, _FIT + 1, device=profile.device, dtype=profile.dtype)
-    solve = step_estimator(offsets, offsets.new_tensor(_BLUR_STEPS))
-    shift = torch.zeros(*index.shape, profile.shape[2], device=profile.device, dtype=profile.dtype)
+    solve = step_estimator(offsets, blur_steps)
+    shift = _steepest_near(profile, index)
     for _ in range(3):
         at = index[..., None, None] + shift[..., None] + offsets
         low = at.floor().clamp(0, profile.shape[-1] - 2)
         share = at - low
         low = low.long()
         window = profile.gather(-1, low) * (1 - share) + profile.gather(-1, low + 1) * share
-        fit = torch.einsum("nd,bkrd->bkrn", solve, window)
-        shift = (shift - (fit[..., 2] / fit[..., 1].clamp(min=1e-3)).clamp(-1.5, 1.5)).clamp(-4.0, 4.0)
-    centre = shift.median(-1).values
-    spread = 1.4826 * (shift - centre[..., None]).abs().median(-1).values
-    return centre, spread * (1.57 / _ROWS) ** 0.5
+        fit = torch.einsum("bknd,bkrd->bkrn", solve, window)
+        shift = (shift - (fit[..., 2] / fit[..., 1].clamp(min=1e-3)).clamp(-1.5, 1.5)).clamp(-12.0, 12.0)
+    return _on_axis(shift)
+
+
+def _steepest_near(profile: Float[Tensor, "b k r n"], index: Tensor) -> Float[Tensor, "b k r"]:
+    """Offset from `index` of the steepest rise of each row, within ten samples: the rim may cross the axis aslant."""
+    offsets = torch.arange(-12, 13, device=profile.device)
+    at = (index[..., None, None] + offsets).clamp(0, profile.shape[-1] - 1).expand(*profile.shape[:3], -1)
+    window = profile.gather(-1, at)
+    slope = window.unfold(-1, 5, 1) @ profile.new_tensor([-1.0, -2.0, 0.0, 2.0, 1.0])
+    return slope.argmax(-1).to(profile.dtype) - 10
+
+
+def _on_axis(shift: Float[Tensor, "b k r"]) -> tuple[Float[Tensor, "b k"], Float[Tensor, "b k"]]:
+    """Value at the middle row of a robust parabola through the rows, and its standard deviation."""
+    row = torch.linspace(-1, 1, _ROWS, device=shift.device, dtype=shift.dtype)
+    columns = torch.stack([torch.ones_like(row), row, row * row], -1)
+    weight = torch.ones_like(shift)
+    for _ in range(6):
+        weighted = columns * weight[..., None]
+        inverse = torch.linalg.inv(weighted.mT @ columns + 1e-6 * torch.eye(3, device=shift.device))
+        solution = (inverse @ (weighted.mT @ shift[..., None]))[..., 0]
+        residual = shift - solution @ columns.mT
+        scale = (1.4826 * residual.abs().median(-1, keepdim=True).values).clamp(min=1e-3)
+        weight = 1.3 / (residual / scale).abs().clamp(min=1.3)
+    return solution[..., 0], scale[..., 0] * inverse[..., 0, 0].clamp(min=0.0).sqrt()

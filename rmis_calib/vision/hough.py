@@ -1,8 +1,8 @@
 """Hough voting in torch: edge pixels vote for lines, the direction of their gradient narrows the votes to a few angles.
 
-A line is (normal angle, signed distance): n . x = rho with n = (cos theta, sin theta) pointing to the *outer* side, where
-the picture is less like a shaft. Theta covers the full turn, so the two contours of a shaft are half a turn apart and a
-line knows on which of its sides the shaft would be.
+A line is (normal angle, signed distance): n . x = rho with n = (cos theta, sin theta) pointing to the *outer* side,
+where the picture is less like a shaft. Theta covers the full turn, so the two contours of a shaft are half a turn apart
+and a line knows on which of its sides the shaft would be.
 """
 
 import math
@@ -17,7 +17,7 @@ from torch.nn.functional import avg_pool2d, max_pool2d, pad
 _ANGLES = 240
 _RHO_STEP_PX = 1.5
 _ANGLE_SPREAD = 3
-"""Each pixel votes for 2 * 3 + 1 angles of 1.5 degrees: sobel gradients on a small picture are good to about 3 degrees."""
+"""Each pixel votes for 2 * 3 + 1 angles of 1.5 degrees: gradients on a small picture are good to about 3 degrees."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
 """Ideal pixels: where a pinhole camera without distortion would have drawn a point of the raw picture.
 
-Contours are straight only after undistortion. The picture itself is never resampled: edge coordinates are moved to ideal
-pixels, lines live there, and samples are read at the raw pixel that belongs to an ideal one.
+Contours are straight only after undistortion. The picture itself is never resampled: edge coordinates are moved to
+ideal pixels, lines live there, and samples are read at the raw pixel that belongs to an ideal one.
 """
 
 from dataclasses import dataclass

@@ -1,8 +1,9 @@
 """Pictures that show what was detected, for reports and for the eye."""
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
-import torch
 
 from rmis_calib.vision.shaft_lines import ShaftDetections
 
@@ -57,19 +58,18 @@ def _end(canvas: np.ndarray, contours: np.ndarray, found: ShaftDetections, frame
     """A bar across the shaft where it ends, and a dot on the axis."""
     if not bool(found.end_valid[frame, rank]):
         return
-    bar = torch.tensor(contours[:, -1]).numpy()
-    _polyline(canvas, bar, _END_COLOUR, weight)
+    _polyline(canvas, contours[:, -1], _END_COLOUR, weight)
     centre = found.end_uv[frame, rank].double().cpu().numpy()
     cv2.circle(canvas, _fixed(centre), (weight + 2) << _SHIFT, _END_COLOUR, -1, cv2.LINE_AA, _SHIFT)
 
 
 def _fixed(point: np.ndarray) -> tuple[int, int]:
-    return int(round(point[0] * (1 << _SHIFT))), int(round(point[1] * (1 << _SHIFT)))
+    return round(float(point[0]) * (1 << _SHIFT)), round(float(point[1]) * (1 << _SHIFT))
 
 
 def _polyline(canvas: np.ndarray, points: np.ndarray, colour: tuple[int, int, int], weight: int) -> None:
     limit = 4.0 * max(canvas.shape)
-    for a, b in zip(points[:-1], points[1:], strict=True):
+    for a, b in pairwise(points):
         if np.isfinite([a, b]).all() and np.abs([a, b]).max() < limit:
             cv2.line(canvas, _fixed(a), _fixed(b), colour, weight, cv2.LINE_AA, _SHIFT)
 

@@ -37,7 +37,7 @@ def longest_run(on: Bool[Tensor, "*b s"], gap: Float[Tensor, "*b"]) -> Bool[Tens
 
 
 def run_minimum(value: Float[Tensor, "*b s"], on: Bool[Tensor, "*b s"]) -> Float[Tensor, "*b s"]:
-    """For every station that is on, the smallest value of its run, blind to single dark stations; infinite where off."""
+    """For every station, the smallest value of its run, blind to single dark stations; infinite where off."""
     steady = pad(value, (1, 1), mode="replicate").unfold(-1, 3, 1).median(-1).values
     steady = torch.where(on, steady, torch.inf)
     label = _run_labels(on)

@@ -1,4 +1,4 @@
-"""What the small picture says for each strip: where along it both contours are there and the inside looks like a shaft."""
+"""What the small picture says for each strip: where both contours are there and the inside looks like a shaft."""
 
 from dataclasses import dataclass
 
@@ -131,7 +131,7 @@ def inspect(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -
 
 
 def score(evidence: Evidence, settings: DetectorSettings) -> Float[Tensor, "b k"]:
-    """Supported length, px, discounted for weak contours, mixed insides or surroundings, and for not reaching a border."""
+    """Supported length, px, less for weak contours, mixed insides or surroundings, and for not reaching a border."""
     quality = evidence.contrast / (evidence.contrast + 0.3)
     entering = torch.where(evidence.start_at_border, 1.0, 0.5)
     long_enough = (evidence.length > settings.min_aspect * evidence.width) & (

@@ -29,8 +29,9 @@ class DetectorSettings:
     min_confidence: float = Field(default=0.3, ge=0, le=1)
     """Candidates below this confidence are not reported."""
     end_run_widths: float = Field(default=1.4, gt=0)
-    """A stretch of shaft beyond an interruption (a ball, a clip) must be this many widths long to carry the shaft's end."""
+    """A stretch of shaft beyond an interruption (a ball, a clip) must be this many widths long to carry the end."""
     edge_samples: int = Field(default=256, ge=32, le=4096)
     """Sub-pixel edge points measured a contour."""
-    sigma_floor_px: float = Field(default=0.02, gt=0)
-    """Smallest standard deviation, px, ever claimed for a point of a contour or an end."""
+    sigma_floor_px: float = Field(default=0.03, gt=0)
+    """Error, px, of the blurred-step model itself, added in quadrature to the uncertainty of every contour; ends carry
+    five times as much."""

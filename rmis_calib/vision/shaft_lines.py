@@ -110,9 +110,10 @@ class ShaftDetector:
         self, pixels: Tensor, trace: Trace, scores: Float[Tensor, "b k"], stages: Stages, broken: Bool[Tensor, " b"]
     ) -> ShaftDetections:
         """Sub-pixel contours, axis and end of the traced strips."""
+        floor = self.settings.sigma_floor_px
         points, fit = self._contours(pixels, trace)
         strips = replace(trace.strips, offset=fit.offset, slope=fit.slope)
-        end = ends.locate(pixels, self.lens, strips, trace.end, trace.width, self.settings.sigma_floor_px * 5)
+        end = ends.locate(pixels, self.lens, strips, trace.end, trace.width, points.blur_px.mean(-1), 5 * floor)
         offered = edges.at_stations(
             trace.sides, trace.t, edges.place_samples(trace.on, trace.t, self.settings.edge_samples)
         )
@@ -138,14 +139,14 @@ class ShaftDetector:
         use = edges.at_stations(trace.sides, trace.t, t)
         points = edges.rough(pixels, lens, strips, t, lateral, use, step)
         main = edges.at_stations(trace.main[:, :, None], trace.t, t).expand_as(both)
-        line = fit_lines(both, points.lateral, points.valid.to(t.dtype), main, settings.sigma_floor_px)
+        line = fit_lines(both, points.lateral, points.valid.to(t.dtype), main, 0.01)
         straight = line.offset[..., None] + line.slope[..., None] * both
         near = points.valid & ((points.lateral - straight).abs() < 4 * line.scatter_px[..., None])
         centre = straight + smooth_over(points.lateral - straight, near)
         points = edges.fine(pixels, lens, strips, t, centre, use, (points.blur_px / 1.3).clamp(1.0, 4.0))
         usual = masked_median(points.height, points.valid)[..., None].clamp(min=1e-6)
         weight = points.valid * (points.height / usual).clamp(0.3, 1.5)
-        return points, fit_lines(both, points.lateral, weight, main, settings.sigma_floor_px)
+        return points, fit_lines(both, points.lateral, weight, main, 0.01)
 
     def _assemble(
         self,
@@ -169,31 +170,34 @@ class ShaftDetector:
         share = torch.linspace(0, 1, _POLYLINE, device=stop.device)
         t = trace.start[..., None] + (stop - trace.start)[..., None] * share
         polyline = strips.points(t[:, :, None].expand(-1, -1, 2, -1), strips.contour(t))
-        sigma = fit.sigma_px / focal
+        sigma = (fit.sigma_px.square() + self.settings.sigma_floor_px**2).sqrt() / focal
         known = trace.start_at_border & ~trace.end_at_border
-        nan = lambda value: torch.where(valid.reshape(*valid.shape, *[1] * (value.ndim - 2)), value, torch.nan)  # noqa: E731
         end_valid = end.valid & valid & ~trace.end_at_border
-        has_end = lambda value: torch.where(end_valid.reshape(*valid.shape, *[1] * (value.ndim - 2)), value, torch.nan)  # noqa: E731
         return ShaftDetections(
             valid=valid,
             reason=reason,
-            contour_xy=nan(contour),
-            contour_sigma=nan(sigma),
-            axis_xy=nan(axis),
-            axis_sigma=nan(0.5 * sigma.square().sum(-1).sqrt()),
-            end_xy=has_end(end_xy),
-            end_sigma=has_end(end.sigma_px / focal),
+            contour_xy=_only(valid, contour),
+            contour_sigma=_only(valid, sigma),
+            axis_xy=_only(valid, axis),
+            axis_sigma=_only(valid, 0.5 * sigma.square().sum(-1).sqrt()),
+            end_xy=_only(end_valid, end_xy),
+            end_sigma=_only(end_valid, end.sigma_px / focal),
             end_valid=end_valid,
             direction_known=known & valid,
-            confidence=nan(confidence),
-            contour_uv=nan(self.lens.to_raw(polyline)),
-            end_uv=has_end(self.lens.to_raw(end_ideal)),
-            scatter_px=nan(fit.scatter_px),
-            blur_px=nan(points.blur_px),
+            confidence=_only(valid, confidence),
+            contour_uv=_only(valid, self.lens.to_raw(polyline)),
+            end_uv=_only(end_valid, self.lens.to_raw(end_ideal)),
+            scatter_px=_only(valid, fit.scatter_px),
+            blur_px=_only(valid, points.blur_px),
         )
 
     def _normalised(self, ideal: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
         return self.lens.normalise(ideal)
+
+
+def _only(mask: Bool[Tensor, "b k"], value: Float[Tensor, "b k ..."]) -> Float[Tensor, "b k ..."]:
+    """The value where the mask holds, NaN elsewhere."""
+    return torch.where(mask.reshape(*mask.shape, *[1] * (value.ndim - 2)), value, torch.nan)
 
 
 def _axis(

@@ -20,10 +20,11 @@ _BORDER_ROWS = 24
 
 
 def shrink(images: Tensor, factor: int) -> Float[Tensor, "b c h w"]:
-    """Area average over `factor` x `factor` blocks, in [0, 1], single precision; the remainder at right and below is cut.
+    """Area average over blocks, in [0, 1], single precision; the remainder at right and below is cut.
 
     Args:
         images: (b, c, H, W), uint8 or floating point in [0, 1].
+        factor: side of a block, px.
     """
     scale = 1.0 / 255.0 if images.dtype == torch.uint8 else 1.0
     values = images.to(torch.float32)
@@ -57,7 +58,7 @@ def field_of_view(rgb: Float[Tensor, "b 3 h w"], black_level: float) -> Bool[Ten
     Per row, black pixels are cut from the left and from the right; the cuts are then made convex, so that a black shaft
     that enters from the border does not bend the border.
     """
-    batch, _, height, width = rgb.shape
+    height, width = rgb.shape[-2:]
     lit = rgb.amax(1) > black_level
     columns = torch.arange(width, device=rgb.device)
     first = torch.where(lit, columns, width).amin(-1).to(torch.float32)
@@ -75,7 +76,7 @@ def field_of_view(rgb: Float[Tensor, "b 3 h w"], black_level: float) -> Bool[Ten
 
 def _convex(extent: Float[Tensor, "b h"]) -> Float[Tensor, "b h"]:
     """Largest convex function below `extent`, on a coarse grid of rows; infinite rows count as absent."""
-    batch, height = extent.shape
+    height = extent.shape[1]
     rows = torch.linspace(0, height - 1, _BORDER_ROWS, device=extent.device).round().long()
     # A column cut by noise in one row must not open the field: the median of three neighbours.
     padded = torch.cat([extent[:, :1], extent, extent[:, -1:]], 1)

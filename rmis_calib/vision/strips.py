@@ -35,7 +35,9 @@ class SmallPicture:
         """Middle of the picture, px."""
         return (self.image_size[1] - 1) / 2, (self.image_size[0] - 1) / 2
 
-    def read(self, ideal: Float[Tensor, "b *points 2"]) -> tuple[Float[Tensor, "b *points"], Bool[Tensor, "b *points"]]:
+    def read(
+        self, ideal: Float[Tensor, "b *points 2"]
+    ) -> tuple[Float[Tensor, " b *points"], Bool[Tensor, " b *points"]]:
         """Unlikeness at ideal points, and whether they lie in the field of view."""
         raw = self.lens.to_raw(ideal)
         values = sample(self.layers, (raw + 0.5) / self.factor - 0.5)
@@ -77,8 +79,13 @@ class Strips:
     def pick(self, index: Tensor) -> "Strips":
         """The strips with these indices, (b, k') int64."""
         wide = index[..., None].expand(*index.shape, 2)
-        vectors = (value.gather(1, wide) for value in (self.origin, self.along, self.offset, self.slope))
-        return Strips(*vectors, self.valid.gather(1, index))
+        return Strips(
+            origin=self.origin.gather(1, wide),
+            along=self.along.gather(1, wide),
+            offset=self.offset.gather(1, wide),
+            slope=self.slope.gather(1, wide),
+            valid=self.valid.gather(1, index),
+        )
 
     def reverse(self, where: Bool[Tensor, "b k"]) -> "Strips":
         """The same strips walked the other way round where asked: left and right change places."""
@@ -95,6 +102,7 @@ def snap(picture: SmallPicture, lines: HoughLines) -> HoughLines:
     """Lines moved onto the ridge of the gradient that they follow, by weighted least squares in a shrinking gate.
 
     Args:
+        picture: the small picture.
         lines: `rho` in full-resolution px.
     """
     stations, step = 96, float(picture.factor)

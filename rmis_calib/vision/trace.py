@@ -1,4 +1,4 @@
-"""Follow both contours of the best strips station by station on the small picture, and find the stretch that is a shaft.
+"""Follow both contours of the best strips, station by station on the small picture, and find what is shaft.
 
 The search for strips assumes straight lines; here each contour may wander by a fifth of the shaft's width, so that a
 lens whose distortion nobody measured, or a bent shaft, does not lose the far end.
@@ -93,8 +93,8 @@ def _follow(picture: SmallPicture, strips: Strips, stations: Float[Tensor, "b k 
     value, seen = picture.read(strips.points(at, both))
     rise = torch.where(seen.all(-1), value[..., 0] - value[..., 1], 0.0)
     best = (rise * torch.exp(-0.5 * (1.2 * share) ** 2)).argmax(-1, keepdim=True)
-    pick = [v.gather(-1, best)[..., 0] for v in (lateral, rise, value[..., 0])]
-    return _Sides(*pick, seen[..., _OFFSETS // 2, :].all(-1))
+    place, step, outer = (v.gather(-1, best)[..., 0] for v in (lateral, rise, value[..., 0]))
+    return _Sides(place, step, outer, seen[..., _OFFSETS // 2, :].all(-1))
 
 
 def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> Trace:
@@ -123,9 +123,9 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
     wander = smooth_over(sides.lateral - line, (on[:, :, None] & sides.seen))
     width = masked_median(left - right, on & sides.seen.all(2))
     on &= run_lengths(on) * spacing > (0.4 * width).clamp(min=2.5 * spacing)[..., None]
-    # The end may lie on a stretch whose contours do not continue these lines (a sleeve, a lens that bends them): there it
-    # is enough that the inside has the shaft's tone and both sides, most of a width away, do not.
-    # Only beyond an interruption, such as a ball: a wrist follows the shaft at once and is darker than tissue as well.
+    # The end may lie on a stretch whose contours do not continue these lines (a sleeve, a lens that bends them): there
+    # it is enough that the inside has the shaft's tone and both sides, most of a width away, do not. Only beyond an
+    # interruption, such as a ball: a wrist follows the shaft at once and is darker than tissue as well.
     far = torch.where(inner_seen[..., 7:], value[..., 7:], inf).amin(-1)
     darker = centre_seen & torch.isfinite(far) & (inner < far - settings.min_contrast) & strips.valid[..., None]
     main = longest_run(on, 0.7 * width / spacing)
@@ -179,8 +179,8 @@ def _own_tone(
 ) -> Bool[Tensor, "b k s"]:
     """Stations whose inside is still the shaft and not the metal of the wrist, which has contours too.
 
-    Where light falls off along the shaft, its contrast to the surroundings stays; where the background changes, its tone
-    stays; a wrist keeps neither. Another stretch of shaft beyond an interruption may be lit differently, so each
+    Where light falls off along the shaft, its contrast to the surroundings stays; where the background changes, its
+    tone stays; a wrist keeps neither. Another stretch of shaft beyond an interruption may be lit differently, so each
     unbroken run is compared with its own darkest part, and only that with what is `known` of the shaft.
     """
     contrast = torch.where(on, outer - inner, 0.0)
