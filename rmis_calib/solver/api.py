@@ -13,7 +13,7 @@ from rmis_calib.solver.initialise import find_candidates
 from rmis_calib.solver.joint import JointFit, solve_joint
 from rmis_calib.solver.measurements import END, HEAD, LINE, Packed, pack
 from rmis_calib.solver.normal import NoiseModel
-from rmis_calib.solver.observability import Sight, look, recognise
+from rmis_calib.solver.observability import Degeneracy, Sight, look, recognise
 from rmis_calib.solver.paper import average, empirical_covariance, influence, solve_paper
 from rmis_calib.solver.problem import MIN_MOTIONS, Problem
 from rmis_calib.solver.relinearise import Kinematics, solve_relinearised
@@ -85,6 +85,10 @@ def _two_step_solution(flat: Problem, R: Tensor, t: Tensor, covariance: Tensor, 
     status = torch.where(torch.isfinite(covariance).all(-1).all(-1) & torch.isfinite(t).all(-1), status, SolveStatus.NON_FINITE)
     seen = packed.line_ok.any(0).any(0)
     nan = torch.full_like(front, torch.nan)
+    sight = _sight(axis_only, R, t, covariance, noise, (False, False, False), settings)
+    static = (sight.degeneracy & Degeneracy.STATIC_LAPAROSCOPE) > 0
+    # A two-step estimate from a laparoscope that stands still is biased by more than its scatter shows (DESIGN.md, section 3).
+    sight = replace(sight, verdict=torch.where(static, sight.verdict.clamp_min(1), sight.verdict))
     return Solution(
         method=method,
         camera_right_T_arm=rigid_from_rotation_translation(R, t),
@@ -99,7 +103,7 @@ def _two_step_solution(flat: Problem, R: Tensor, t: Tensor, covariance: Tensor, 
         noise={},
         nuisances={},
         bias=torch.zeros_like(covariance[..., 0]),
-        sight=_sight(axis_only, R, t, covariance, noise, (False, False, False), settings),
+        sight=sight,
         **_residuals(packed, state),
     )
 
