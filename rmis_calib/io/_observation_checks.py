@@ -23,7 +23,7 @@ _SHAPES: dict[str, tuple[int, ...]] = {
     **{f"sigma_{kind}_{side}": shape for kind, shape in _SIGMA.items() for side in _SIDES},
 }
 _LEVELS = tuple(f"sigma_{what}_{unit}" for what in ("kinematics", "camera", "stereo") for unit in ("mm", "rad"))
-_SCALARS = ("shaft_radius_mm", "sigma_image", *_LEVELS)
+_SCALARS = ("shaft_radius_mm", "sigma_image", "sigma_edge_bias", *_LEVELS)
 _NEEDS = {"contour": "shaft_radius_mm", "end": "rcm_s_end_mm", "head": "rcm_p_head"}
 # Rounding of single precision stays below; a direction that was never normalised does not.
 _UNIT_TOLERANCE = 1e-6

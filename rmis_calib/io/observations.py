@@ -71,6 +71,9 @@ class ShaftObservations:
     sigma_stereo_mm: float | None = None
     """Per axis, of `camera_left_T_camera_right`."""
     sigma_stereo_rad: float | None = None
+    sigma_edge_bias: float | None = None
+    """Of an error that all pictures of a camera share: each contour point is off across its line by the same amount in
+    every motion (lens model, edge detector), normalised units. It does not average out."""
     sigma_axis_right: np.ndarray | None = None
     """(N,): one sigma of both points across the line, normalised units; NaN: `sigma_image`. The others likewise."""
     sigma_axis_left: np.ndarray | None = None

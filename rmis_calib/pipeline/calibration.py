@@ -144,7 +144,7 @@ def _solve_choice(
         motions = _motions(recording, views, poses, choices, None)
         return CalibrationRun(_insufficient(config, motions), recording, views, poses, choices, None, None)
     progress("solving", 0, 1)
-    observations = assemble(recording, poses, views, choices, config.model_sigma_px)
+    observations = assemble(recording, poses, views, choices, config)
     try:
         solution = estimate(observations, config)
     except InsufficientDataError as error:

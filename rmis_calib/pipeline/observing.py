@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from rmis_calib.config import CalibrationConfig
 from rmis_calib.geometry.lines import contour_planes, point_line_distance
 from rmis_calib.geometry.rigid import rotate_vectors, transform_points
 from rmis_calib.io import Recording, ShaftObservations
@@ -79,7 +80,7 @@ def assemble(
     poses: MotionPoses,
     views: tuple[View, ...],
     choices: tuple[Choice, ...],
-    model_sigma_px: float = 0.0,
+    config: CalibrationConfig,
 ) -> ShaftObservations:
     """The solver's input, one motion a frame whose joints are known.
 
@@ -88,11 +89,11 @@ def assemble(
         poses: kinematics of the motions.
         views: detections of every frame.
         choices: candidate of every motion, one entry a view.
-        model_sigma_px: added in quadrature to the sigma of every contour and end.
+        config: what the pictures leave out.
     """
     arrays: dict[str, np.ndarray] = {}
     for view, choice in zip(views, choices, strict=True):
-        floor = 0.0 if view.camera is None else model_sigma_px / float(view.camera.focal)
+        floor = config.model_sigma_px / float(recording.stereo.right.focal)
         arrays |= _measured(view.side, select_frames(view.detections, poses.frames), choice, floor)
     extrinsics = recording.stereo.camera_left_T_camera_right
     return ShaftObservations(
@@ -101,6 +102,7 @@ def assemble(
         camera_left_T_camera_right=extrinsics.matrix.numpy() if extrinsics is not None and len(views) == 2 else None,
         shaft_radius_mm=recording.shaft_diameter_mm / 2,
         rcm_s_end_mm=poses.rcm_s_end_mm.cpu().numpy(),
+        sigma_edge_bias=config.edge_bias_px / float(recording.stereo.right.focal),
         **head_observations(recording, poses),
         **arrays,
     )

@@ -18,7 +18,8 @@ from rmis_calib.solver.robust import anneal, chi2_quantile, inlier_weight, trunc
 from rmis_calib.solver.robust_start import robust_candidates
 from rmis_calib.solver.settings import SolverSettings
 from rmis_calib.solver.statistics import LineStatistics
-from rmis_calib.solver.unknowns import Layout, initial_state, make_layout
+from rmis_calib.solver.systematic import systematic_covariance
+from rmis_calib.solver.unknowns import Layout, Nominal, initial_state, make_layout
 from rmis_calib.solver.variance import assumed_noise, estimate_components
 
 START_ITERATIONS = 12
@@ -78,8 +79,9 @@ def solve_joint(problem: Problem, settings: SolverSettings, start: "JointFit | N
         state, noise, contaminated = _compete(problem, packed, order, assumed, free, settings)
     else:
         state, noise, contaminated = start.state, start.noise, False
-    fresh = initial_state(problem, state.R, state.t)
-    layout = make_layout(problem, packed, fresh, settings.unknowns, settings.noise)
+    nominal = Nominal.of(problem)
+    fresh = initial_state(nominal, state.R, state.t)
+    layout = make_layout(nominal, packed, fresh, settings.unknowns, settings.noise)
     state = fresh if start is not None else state
     _check_rows(packed, layout)
     sample = packed.take_motions(order[:SAMPLE_MOTIONS]) if packed.motions > SAMPLE_MOTIONS else packed
@@ -116,13 +118,18 @@ def _finish(
     weight_all = torch.ones_like(packed.line_ok[0], dtype=packed.p.dtype) if weight is None else weight
     scale = information.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
     inverse = torch.linalg.pinv(information * scale[:, :, None] * scale[:, None], hermitian=True, rtol=1e-15)
+    covariance = inverse * scale[:, :, None] * scale[:, None]
+    if bool((problem.noise.edge_bias > 0).any()):
+        covariance = covariance + systematic_covariance(
+            packed, state, layout, noise, covariance, problem.noise.edge_bias, settings.chunk, weight
+        )
     return JointFit(
         problem=problem,
         packed=packed,
         state=state,
         layout=layout,
         noise=noise,
-        covariance=inverse * scale[:, :, None] * scale[:, None],
+        covariance=covariance,
         chi2=normal.chi2,
         rows=normal.rows,
         weight=weight_all,
@@ -221,13 +228,14 @@ def _race(
 ) -> _Race:
     """Refines every start on the sample and keeps, per trial, the one of least truncated cost among those in front of the camera."""
     b, s = R.shape[:2]
+    nominal = Nominal.of(problem)
     states, kept = [], []
     step = max(1, settings.chunk // (s * sample.motions))
     for start in range(0, b, step):
         part = slice(start, min(start + step, b))
         many = sample.narrow(part, slice(None)).repeat_trials(s)
         noise = assumed.take(part).repeat(s)
-        narrowed = _take_trials(problem, part, s)
+        narrowed = nominal.repeat(part, s)
         state = initial_state(narrowed, R[part].flatten(0, 1), t[part].flatten(0, 1))
         layout = make_layout(narrowed, many, state, settings.unknowns, settings.noise)
         if robust:
@@ -259,23 +267,6 @@ def _sure(H: Float[Tensor, "b p p"]) -> Bool[Tensor, " b"]:
     """Whether the sample alone fixes the rotation to SURE_RAD: then no second minimum fits as well."""
     covariance = torch.linalg.pinv(torch.nan_to_num(H), hermitian=True)
     return covariance[:, :3, :3].diagonal(dim1=-2, dim2=-1).sum(-1) < SURE_RAD**2
-
-
-def _take_trials(problem: Problem, part: slice, times: int) -> Problem:
-    """The small per-trial tensors of a problem for some trials, each repeated; the motions stay behind."""
-    cameras = problem.camera_T_camera_right[part].repeat_interleave(times, 0)
-    noise = type(problem.noise)(**{k: v[part].repeat_interleave(times) for k, v in vars(problem.noise).items()})
-    small = {
-        name: None if (value := getattr(problem, name)) is None else value[part].repeat_interleave(times, 0)
-        for name in ("joint_offset_sigma", "joint_offset_at", "clock_at")
-    }
-    return replace(
-        problem,
-        camera_T_camera_right=cameras,
-        radius_mm=problem.radius_mm[part].repeat_interleave(times),
-        noise=noise,
-        **small,
-    )
 
 
 def _inflation(distance2: Tensor, rows: Tensor) -> Float[Tensor, " b"]:

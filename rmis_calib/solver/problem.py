@@ -30,6 +30,7 @@ class NoiseLevels:
         camera_rad: its orientation.
         stereo_mm: per axis, of `camera_left_T_camera_right`, drawn once.
         stereo_rad: its orientation.
+        edge_bias: of a shift across the line that a contour point has in every motion alike, normalised units.
     """
 
     image: Float[Tensor, "*batch"]
@@ -39,6 +40,7 @@ class NoiseLevels:
     camera_rad: Float[Tensor, "*batch"]
     stereo_mm: Float[Tensor, "*batch"]
     stereo_rad: Float[Tensor, "*batch"]
+    edge_bias: Float[Tensor, "*batch"]
 
 
 @dataclass(frozen=True)
@@ -166,7 +168,7 @@ class Problem:
 OBSERVATION_KEYS = (
     "arm_T_rcm", "rcm_v_axis", "camera_left_T_camera_right", "axis_right", "axis_left", "contour_right", "contour_left",
     "shaft_radius_mm", "end_right", "end_left", "rcm_s_end_mm", "head_right", "head_left", "rcm_p_head", "valid_right", "valid_left",
-    "sigma_image", "sigma_kinematics_mm", "sigma_kinematics_rad", "sigma_camera_mm", "sigma_camera_rad", "sigma_stereo_mm",
+    "sigma_image", "sigma_kinematics_mm", "sigma_kinematics_rad", "sigma_camera_mm", "sigma_camera_rad", "sigma_stereo_mm", "sigma_edge_bias",
     "sigma_stereo_rad", "sigma_axis_right", "sigma_axis_left", "sigma_contour_right", "sigma_contour_left", "sigma_end_right",
     "sigma_end_left", "sigma_head_right", "sigma_head_left",
 )  # fmt: skip
@@ -211,7 +213,7 @@ class _Reader:
 
     def noise(self) -> NoiseLevels:
         levels = {field.name: self.filled(f"sigma_{field.name}") for field in fields(NoiseLevels)}
-        for name in ("camera_mm", "camera_rad"):
+        for name in ("camera_mm", "camera_rad", "edge_bias"):
             levels[name] = torch.nan_to_num(levels[name], nan=0.0)
         return NoiseLevels(**levels)
 

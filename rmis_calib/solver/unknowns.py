@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rmis_calib.solver.measurements import Packed
+from rmis_calib.solver.measurements import LINE, Packed
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.residuals import Rows, Shaft, State, rcm_axes
 from rmis_calib.solver.settings import NoiseSettings, UnknownSettings
@@ -27,6 +27,9 @@ UNITS = {
 TRANSLATION_SIGMA_MM = 2000.0
 """Prior of the hand-eye translation about zero: no arm is longer. It moves a translation of 200 mm known to 1 mm by 5e-5 mm, and keeps one that the data
 cannot see within the operating theatre."""
+
+EDGE_BIAS = "edge_bias"
+"""Block of the shifts that `systematic.py` considers; never one of the unknowns."""
 
 
 @dataclass(frozen=True)
@@ -73,39 +76,75 @@ class Layout:
             "joint_offset": state.joint_offset - origin.joint_offset,
             "clock": (state.clock - origin.clock)[:, None],
         }
+        if EDGE_BIAS in self.blocks:
+            deviation[EDGE_BIAS] = torch.zeros_like(self.sigma[:, self.blocks[EDGE_BIAS]])
         return torch.cat([deviation[name] for name in self.blocks], dim=-1), self.sigma.square().reciprocal()
 
 
-def initial_state(problem: Problem, R: Float[Tensor, "b 3 3"], t: Float[Tensor, "b 3"]) -> State:
+@dataclass(frozen=True)
+class Nominal:
+    """What a problem gives once a trial: the nominal values of the unknowns beside the transform, and their priors where the data name them.
+
+    Attributes:
+        stereo: `camera_T_camera_right` of the last camera.
+        radius: mm; 0 where unknown.
+        stereo_mm, stereo_rad: given noise of the stereo extrinsics; NaN where unknown.
+        joint_offset_sigma: prior of each joint offset (no joints: none can be estimated).
+        joint_offset_at, clock_at: where the kinematics were evaluated.
+    """
+
+    stereo: Float[Tensor, "b 4 4"]
+    radius: Float[Tensor, " b"]
+    stereo_mm: Float[Tensor, " b"]
+    stereo_rad: Float[Tensor, " b"]
+    joint_offset_sigma: Float[Tensor, "b j"]
+    joint_offset_at: Float[Tensor, "b j"]
+    clock_at: Float[Tensor, " b"]
+
+    @classmethod
+    def of(cls, problem: Problem) -> "Nominal":
+        """Of a problem with one trial axis."""
+        none = problem.radius_mm.new_zeros(problem.n_trials, 0)
+        sigma = none if problem.joint_offset_sigma is None else problem.joint_offset_sigma
+        return cls(
+            stereo=problem.camera_T_camera_right[:, -1],
+            radius=torch.nan_to_num(problem.radius_mm),
+            stereo_mm=problem.noise.stereo_mm,
+            stereo_rad=problem.noise.stereo_rad,
+            joint_offset_sigma=sigma,
+            joint_offset_at=torch.zeros_like(sigma) if problem.joint_offset_at is None else problem.joint_offset_at,
+            clock_at=torch.zeros_like(problem.radius_mm) if problem.clock_at is None else problem.clock_at,
+        )
+
+    def repeat(self, part: slice, times: int) -> "Nominal":
+        """Of some trials, each repeated."""
+        return Nominal(**{name: value[part].repeat_interleave(times, 0) for name, value in vars(self).items()})
+
+
+def initial_state(nominal: Nominal, R: Float[Tensor, "b 3 3"], t: Float[Tensor, "b 3"]) -> State:
     """The hand-eye transform with every other unknown at its nominal value."""
     zero = t[:, 0] * 0.0
-    joints = 0 if problem.joint_derivative is None else problem.joint_derivative.shape[-1]
-    stereo = problem.camera_T_camera_right[:, -1]
     return State(
         R=R,
         t=t,
-        stereo_R=stereo[:, :3, :3],
-        stereo_t=stereo[:, :3, 3],
-        radius=torch.nan_to_num(problem.radius_mm),
+        stereo_R=nominal.stereo[:, :3, :3],
+        stereo_t=nominal.stereo[:, :3, 3],
+        radius=nominal.radius,
         end_offset=zero,
         rcm_offset=zero[:, None].expand(-1, 2),
-        joint_offset=zero[:, None].expand(-1, joints),
+        joint_offset=torch.zeros_like(nominal.joint_offset_at),
         clock=zero,
     )
 
 
-def prior_centre(problem: Problem, state: State) -> State:
-    """State that the priors are centred on. Offsets of a state count from where the kinematics were evaluated, priors from zero."""
-    joints = -problem.joint_offset_at if problem.joint_offset_at is not None else torch.zeros_like(state.joint_offset)
-    clock = -problem.clock_at if problem.clock_at is not None else torch.zeros_like(state.clock)
-    return replace(state, joint_offset=joints, clock=clock)
+def make_layout(nominal: Nominal, packed: Packed, origin: State, settings: UnknownSettings, noise: NoiseSettings) -> Layout:
+    """The parameters that the settings ask for and the measurements can carry.
 
-
-def make_layout(problem: Problem, packed: Packed, origin: State, settings: UnknownSettings, noise: NoiseSettings) -> Layout:
-    """The parameters that the settings ask for and the measurements can carry."""
+    Offsets of a state count from where the kinematics were evaluated, their priors from zero.
+    """
     b, like = origin.t.shape[0], origin.t
-    stereo_rad = torch.nan_to_num(problem.noise.stereo_rad, nan=noise.stereo_deg * torch.pi / 180.0)
-    stereo_mm = torch.nan_to_num(problem.noise.stereo_mm, nan=noise.stereo_mm)
+    stereo_rad = torch.nan_to_num(nominal.stereo_rad, nan=noise.stereo_deg * torch.pi / 180.0)
+    stereo_mm = torch.nan_to_num(nominal.stereo_mm, nan=noise.stereo_mm)
     infinite = torch.full_like(like[:, 0], torch.inf)
     far = torch.full_like(infinite, TRANSLATION_SIGMA_MM)
     entries: list[tuple[str, int, Tensor]] = [("rotation", 3, infinite), ("translation", 3, far)]
@@ -117,8 +156,8 @@ def make_layout(problem: Problem, packed: Packed, origin: State, settings: Unkno
         entries.append(("end_offset", 1, torch.full_like(infinite, settings.end_offset_sigma_mm)))
     if settings.rcm_offset:
         entries.append(("rcm_offset", 2, torch.full_like(infinite, settings.rcm_offset_sigma_mm)))
-    if settings.joint_offsets and packed.joint is not None and problem.joint_offset_sigma is not None:
-        entries.append(("joint_offset", packed.joint.shape[1], problem.joint_offset_sigma))
+    if settings.joint_offsets and packed.joint is not None and nominal.joint_offset_sigma.shape[1] > 0:
+        entries.append(("joint_offset", packed.joint.shape[1], nominal.joint_offset_sigma))
     if settings.clock and packed.clock is not None:
         entries.append(("clock", 1, torch.full_like(infinite, settings.clock_sigma_s)))
     entries = [entry for entry in entries if bool((entry[2] > 0).any())]
@@ -127,7 +166,8 @@ def make_layout(problem: Problem, packed: Packed, origin: State, settings: Unkno
         blocks[name] = slice(start, start + width)
         sigmas.append(sigma if sigma.ndim == 2 else sigma[:, None].expand(b, width))
         start += width
-    return Layout(blocks, torch.cat(sigmas, dim=-1).clamp_min(1e-12), prior_centre(problem, origin))
+    centre = replace(origin, joint_offset=-nominal.joint_offset_at, clock=-nominal.clock_at)
+    return Layout(blocks, torch.cat(sigmas, dim=-1).clamp_min(1e-12), centre)
 
 
 def columns(layout: Layout, rows: Rows, shaft: Shaft, packed: Packed, state: State) -> Float[Tensor, "k p b n"]:
@@ -157,7 +197,16 @@ def columns(layout: Layout, rows: Rows, shaft: Shaft, packed: Packed, state: Sta
         put("joint_offset", torch.stack([_effect(rows, R, packed.joint[:, j]) for j in range(packed.joint.shape[1])], dim=1))
     if "clock" in layout.blocks and packed.clock is not None:
         put("clock", _effect(rows, R, packed.clock)[:, None])
+    if EDGE_BIAS in layout.blocks:
+        put(EDGE_BIAS, _shifts(packed, rows.r))
     return out
+
+
+def _shifts(packed: Packed, like: Float[Tensor, "k b n"]) -> Float[Tensor, "k s b n"]:
+    """A unit shift of each line row where it was measured; line rows come first."""
+    count = packed.row_kind.count(LINE)
+    unit = torch.eye(like.shape[0], count, dtype=like.dtype, device=like.device)
+    return unit[:, :, None, None] * packed.rows_ok[:, None]
 
 
 def _effect(rows: Rows, R: Tensor, displacement: Float[Tensor, "6 b n"]) -> Float[Tensor, "k b n"]:

@@ -1,0 +1,104 @@
+"""The whole path on rendered recordings: what a user types, and how far the answer is from the truth."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import data_synth
+import rmis_calib as rc
+from rmis_calib.cli import main
+from rmis_calib.pipeline.evaluation import CHI_3_SIGMA
+
+
+@pytest.fixture(scope="module")
+def demo_output(tmp_path_factory):
+    """`rmis-calib demo` as `make demo` runs it: 60 motions, stereo, 640x480, 0.1 mm / 0.03 deg of kinematic noise."""
+    out = tmp_path_factory.mktemp("demo") / "demo_output"
+    assert main(["demo", "--out", str(out)]) == 0
+    return out
+
+
+@pytest.mark.slow
+def test_demo_is_within_a_tenth_of_a_degree_and_its_own_sigmas(demo_output):
+    result = rc.CalibrationResult.read(demo_output / "calibration" / "result.json")
+    evaluation = rc.evaluate(result, demo_output / "recording")
+    assert evaluation.rotation_error_deg <= 0.10
+    assert evaluation.translation_error_mm <= 0.3
+    assert evaluation.error_sigmas <= CHI_3_SIGMA
+    assert evaluation.head_point_error_px["right"]["median"] < 2.0
+
+
+@pytest.mark.slow
+def test_demo_leaves_everything_a_user_looks_at(demo_output):
+    calibration = demo_output / "calibration"
+    names = {path.name for path in calibration.iterdir()}
+    assert {"result.json", "report.html", "observations.npz", "config.yaml", "overlays"} <= names
+    result = json.loads((calibration / "result.json").read_text())
+    assert result["status"] == "ok"
+    assert result["motions"]["used"] >= 54
+    assert "ground_truth" not in (calibration / "report.html").read_text()
+
+
+@pytest.mark.slow
+def test_solving_the_written_observations_gives_the_same_answer(demo_output, tmp_path):
+    calibration = demo_output / "calibration"
+    assert main(["solve", str(calibration / "observations.npz"), "--out", str(tmp_path / "again.json")]) == 0
+    first = rc.CalibrationResult.read(calibration / "result.json")
+    again = rc.CalibrationResult.read(tmp_path / "again.json")
+    np.testing.assert_allclose(again.camera_right_T_arm.matrix, first.camera_right_T_arm.matrix, atol=1e-9)
+    np.testing.assert_allclose(again.covariance, first.covariance, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_config_file_written_beside_the_result_repeats_it(demo_output):
+    config = rc.load_config(demo_output / "calibration" / "config.yaml")
+    assert config == rc.CalibrationConfig()
+
+
+@pytest.fixture(scope="module")
+def static_observations(tmp_path_factory):
+    """Detections of a rendered recording whose laparoscope stands still."""
+    path = tmp_path_factory.mktemp("static") / "recording"
+    config = {"motions": 60, "seed": 11, "motion": {"laparoscope": "static"}}
+    data_synth.write_recording(path, data_synth.load_synth_config(config))
+    run = rc.run_calibration(rc.load_recording(path))
+    return path, run.result, run.observations
+
+
+def mono(observations):
+    """The same motions seen by the right camera alone."""
+    left = [name for name in vars(observations) if name.endswith("_left")]
+    return replace(observations, camera_left_T_camera_right=None, **dict.fromkeys(left))
+
+
+@pytest.mark.slow
+def test_static_laparoscope_stereo(static_observations):
+    path, result, _ = static_observations
+    assert result.status == "ok"
+    evaluation = rc.evaluate(result, path)
+    assert evaluation.rotation_error_deg <= 0.15
+    assert evaluation.translation_error_mm <= 0.6
+    assert evaluation.error_sigmas <= CHI_3_SIGMA
+
+
+@pytest.mark.slow
+def test_static_laparoscope_mono(static_observations):
+    path, _, observations = static_observations
+    evaluation = rc.evaluate(rc.solve(mono(observations)), path)
+    assert evaluation.rotation_error_deg <= 0.15
+    assert evaluation.translation_error_mm <= 0.6
+    assert evaluation.error_sigmas <= CHI_3_SIGMA
+
+
+@pytest.mark.slow
+def test_static_laparoscope_mono_axis_lines_only_is_refused_by_name(static_observations):
+    _, _, observations = static_observations
+    config = rc.CalibrationConfig(measurements=("axis",))
+    with pytest.raises(rc.CalibrationFailed) as caught:
+        rc.solve(mono(observations), config)
+    words = str(caught.value)
+    assert "translation along" in words
+    assert "did not move" in words
+    assert caught.value.result.status == "unobservable"
