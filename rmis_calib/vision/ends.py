@@ -109,7 +109,8 @@ def _steepest_near(profile: Float[Tensor, "b k r n"], index: Tensor) -> Float[Te
     at = (index[..., None, None] + offsets).clamp(0, profile.shape[-1] - 1).expand(*profile.shape[:3], -1)
     window = profile.gather(-1, at)
     slope = window.unfold(-1, 5, 1) @ profile.new_tensor([-1.0, -2.0, 0.0, 2.0, 1.0])
-    return slope.argmax(-1).to(profile.dtype) - 10
+    near = torch.exp(-0.5 * (torch.arange(-10, 11, device=profile.device) / 5.0) ** 2)
+    return (slope * near).argmax(-1).to(profile.dtype) - 10
 
 
 def _on_axis(shift: Float[Tensor, "b k r"]) -> tuple[Float[Tensor, "b k"], Float[Tensor, "b k"]]:

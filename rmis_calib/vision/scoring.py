@@ -12,6 +12,9 @@ from rmis_calib.vision.strips import SmallPicture, Strips
 
 _STATIONS = 128
 _INNER, _RIM = 7, 4
+MAX_BRIGHTER = 0.55
+"""Log brightness by which the inside of a shaft may exceed its surroundings. Slate-grey shafts on dark liver reach 0.3;
+white and bare metal instruments, less tinted than tissue as well, start at 0.6."""
 # A wrist of bare metal lies about half-way between shaft and tissue (0.5 to 0.7 in both da Vinci and grasper pictures);
 # shading along a shaft stays below 0.25.
 _SHAFT_SHARE = 0.38
@@ -73,7 +76,7 @@ def _profiles(picture: SmallPicture, strips: Strips, t: Float[Tensor, " s"], nar
     far = torch.stack([(0.2 * width).clamp(min=3 * unit), (0.4 * width).clamp(min=5 * unit)], -1)
     beyond_y = torch.cat([left[..., None] + far, right[..., None] - far], -1)
     lateral = torch.cat([inner_y, rim_y, beyond_y], -1)
-    value, seen = picture.read(strips.points(stations[..., None].expand_as(lateral), lateral))
+    value, seen, tone = picture.read(strips.points(stations[..., None].expand_as(lateral), lateral))
     rim, beyond = value[..., _INNER : _INNER + _RIM], value[..., _INNER + _RIM :]
     inner = value[..., :_INNER].median(-1).values
     inf = value.new_tensor(torch.inf)
@@ -88,7 +91,8 @@ def _profiles(picture: SmallPicture, strips: Strips, t: Float[Tensor, " s"], nar
     free = (beyond > middle) | ~seen[..., _INNER + _RIM :]
     purity = (value[..., :_INNER] < middle).float().mean(-1) * free.float().mean(-1)
     centre_seen = seen[..., _INNER // 2]
-    is_open = centre_seen & one_side & (width > narrowest_px) & strips.valid[..., None]
+    brighter = tone[..., :_INNER].median(-1).values - 0.5 * (tone[..., _INNER] + tone[..., _INNER + 3])
+    is_open = centre_seen & one_side & (width > narrowest_px) & strips.valid[..., None] & (brighter < MAX_BRIGHTER)
     return _Profiles(inner, outer, step, purity, is_open, both_sides, centre_seen, width)
 
 

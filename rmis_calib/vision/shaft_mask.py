@@ -42,14 +42,17 @@ def scene_tint(rgb: Float[Tensor, "b 3 h w"], seen: Bool[Tensor, "b h w"]) -> Fl
     return 0.5 * (chroma.norm(dim=1) + torch.einsum("bchw,bc->bhw", chroma, direction))
 
 
-def unlikeness(rgb: Float[Tensor, "b 3 h w"], seen: Bool[Tensor, "b h w"]) -> Float[Tensor, "b h w"]:
+def unlikeness(
+    rgb: Float[Tensor, "b 3 h w"], seen: Bool[Tensor, "b h w"]
+) -> tuple[Float[Tensor, "b h w"], Float[Tensor, "b h w"]]:
     """Low on a dark neutral shaft, higher on everything around it: log brightness plus the scene's tint.
 
-    A step of 0.1 is a tenth in brightness.
+    Returns:
+        the sum, in which a step of 0.1 is a tenth in brightness, and log brightness alone.
     """
     smooth = gaussian_blur2d(rgb, (7, 7), (1.4, 1.4))
     tone = (smooth.amax(1) + _TONE_FLOOR).log()
-    return tone + _TINT_WEIGHT * scene_tint(smooth, seen)
+    return tone + _TINT_WEIGHT * scene_tint(smooth, seen), tone
 
 
 def field_of_view(rgb: Float[Tensor, "b 3 h w"], black_level: float) -> Bool[Tensor, "b h w"]:

@@ -20,8 +20,8 @@ from rmis_calib.vision.settings import DetectorSettings
 class SmallPicture:
     """The small picture and how to read it at full-resolution ideal pixels."""
 
-    layers: Float[Tensor, "b 2 h w"]
-    """Unlikeness to a shaft; 1 inside the field of view, else 0."""
+    layers: Float[Tensor, "b 3 h w"]
+    """Unlikeness to a shaft; 1 inside the field of view, else 0; log brightness."""
     factor: int
     """Full-resolution pixels a small one."""
     image_size: tuple[int, int]
@@ -37,11 +37,11 @@ class SmallPicture:
 
     def read(
         self, ideal: Float[Tensor, "b *points 2"]
-    ) -> tuple[Float[Tensor, " b *points"], Bool[Tensor, " b *points"]]:
-        """Unlikeness at ideal points, and whether they lie in the field of view."""
+    ) -> tuple[Float[Tensor, " b *points"], Bool[Tensor, " b *points"], Float[Tensor, " b *points"]]:
+        """Unlikeness at ideal points, whether they lie in the field of view, and log brightness."""
         raw = self.lens.to_raw(ideal)
         values = sample(self.layers, (raw + 0.5) / self.factor - 0.5)
-        return values[..., 0], (values[..., 1] > 0.75) & inside(raw, self.image_size)
+        return values[..., 0], (values[..., 1] > 0.75) & inside(raw, self.image_size), values[..., 2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +114,7 @@ def snap(picture: SmallPicture, lines: HoughLines) -> HoughLines:
     points = (
         centre + across[..., None] * lines.normal[:, :, None, None] + (t[:, None, None] * tangent[:, :, None, None])
     )
-    value, seen = picture.read(points)
+    value, seen, _ = picture.read(points)
     rise = ((value[..., 2:] - value[..., :-2]) * (seen[..., 2:] & seen[..., :-2])).clamp(0.0, 0.5)
     place = deltas[1:-1].expand_as(rise)
     offset, slope = torch.zeros_like(lines.rho), torch.zeros_like(lines.rho)

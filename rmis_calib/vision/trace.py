@@ -24,6 +24,7 @@ from rmis_calib.vision.runs import (
     run_range,
     smooth_over,
 )
+from rmis_calib.vision.scoring import MAX_BRIGHTER
 from rmis_calib.vision.settings import DetectorSettings
 from rmis_calib.vision.strips import SmallPicture, Strips
 
@@ -75,6 +76,7 @@ class _Sides:
     lateral: Float[Tensor, "b k 2 s"]
     rise: Float[Tensor, "b k 2 s"]
     outer: Float[Tensor, "b k 2 s"]
+    brightness: Float[Tensor, "b k 2 s"]
     seen: Bool[Tensor, "b k 2 s"]
 
 
@@ -90,11 +92,12 @@ def _follow(picture: SmallPicture, strips: Strips, stations: Float[Tensor, "b k 
     outward = stations.new_tensor([1.0, -1.0])[:, None, None]
     both = torch.stack([lateral + near * outward, lateral - near * outward], -1)
     at = stations[:, :, None, :, None, None].expand_as(both)
-    value, seen = picture.read(strips.points(at, both))
+    value, seen, tone = picture.read(strips.points(at, both))
     rise = torch.where(seen.all(-1), value[..., 0] - value[..., 1], 0.0)
     best = (rise * torch.exp(-0.5 * (1.2 * share) ** 2)).argmax(-1, keepdim=True)
     place, step, outer = (v.gather(-1, best)[..., 0] for v in (lateral, rise, value[..., 0]))
-    return _Sides(place, step, outer, seen[..., _OFFSETS // 2, :].all(-1))
+    beside = tone[..., 0].gather(-1, best)[..., 0]
+    return _Sides(place, step, outer, beside, seen[..., _OFFSETS // 2, :].all(-1))
 
 
 def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> Trace:
@@ -106,7 +109,7 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
     left, right = sides.lateral.unbind(2)
     across = t.new_tensor([-0.35, -0.233, -0.117, 0.0, 0.117, 0.233, 0.35, -0.85, 0.85])
     inner_y = 0.5 * (left + right)[..., None] + (left - right)[..., None] * across
-    value, inner_seen = picture.read(strips.points(stations[..., None].expand_as(inner_y), inner_y))
+    value, inner_seen, tone = picture.read(strips.points(stations[..., None].expand_as(inner_y), inner_y))
     # The third darkest of seven: a glare stripe may cover half of the width and more.
     inner, centre_seen = value[..., :7].kthvalue(3, -1).values, inner_seen[..., 3]
 
@@ -115,6 +118,7 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
     outer = torch.where(sides.seen, sides.outer, inf).amin(2)
     wide = left - right > settings.min_width_fraction * picture.image_size[1]
     on = centre_seen & sides.seen.any(2) & wide & strips.valid[..., None]
+    on &= tone[..., :7].median(-1).values - sides.brightness.mean(2) < MAX_BRIGHTER
     on &= (step > settings.min_contrast) & (inner < outer - 0.5 * settings.min_contrast)
     surround = masked_median(torch.where(on, outer, 0.0) - inner, on)
     on &= _own_tone(inner, outer, on, on)
