@@ -91,7 +91,10 @@ def contour_errors(picture: np.ndarray, polyline: np.ndarray) -> list[tuple[floa
     found = []
     for k in range(2, len(polyline) - 8, 4):
         a, b, mid = polyline[k], polyline[k + 4], polyline[k + 2]
-        (u0, v0), (u1, v1) = (np.clip(c, 0, np.array(picture.shape)[::-1] - 1).astype(int) for c in (np.minimum(a, b) - 5, np.maximum(a, b) + 6))
+        (u0, v0), (u1, v1) = (
+            np.clip(c, 0, np.array(picture.shape)[::-1] - 1).astype(int)
+            for c in (np.minimum(a, b) - 5, np.maximum(a, b) + 6)
+        )
         v, u = np.mgrid[v0:v1, u0:u1]
         length = np.linalg.norm(b - a)
         d = (b - a) / length
@@ -136,6 +139,7 @@ def end_error(picture: np.ndarray, truth: SideTruth, i: int) -> float:
     v, u = np.mgrid[0 : picture.shape[0], 0 : picture.shape[1]]
     along, across = (u - at[0]) * d[0] + (v - at[1]) * d[1], (v - at[1]) * d[0] - (u - at[0]) * d[1]
     near = (np.abs(across) < 1.0) & (np.abs(along) < 3.0)
+
     # The rim is a curve: a parabola across, and the shading leans a little with it.
     def model(xy: np.ndarray, s: float, low: float, high: float, width: float, lean: float, bow: float) -> np.ndarray:
         return edge_profile(xy[0] - lean * xy[1] - bow * xy[1] ** 2, s, low, high, width)
@@ -146,8 +150,10 @@ def end_error(picture: np.ndarray, truth: SideTruth, i: int) -> float:
 
 
 def test_hidden_points_are_where_the_foreground_is_drawn() -> None:
-    config = dataclasses.replace(load_synth_config("brutal"), motions=4)
-    plain = dataclasses.replace(config.camera, exposure_s=0.0, readout_s=0.0, field_delay_s=0.0, round_field=0.0, vignette=0.0)
+    config = dataclasses.replace(load_synth_config("brutal"), motions=40)
+    plain = dataclasses.replace(
+        config.camera, exposure_s=0.0, readout_s=0.0, field_delay_s=0.0, round_field=0.0, vignette=0.0
+    )
     look = dataclasses.replace(config.look, smoke=0.0, other_instruments=())
     config = dataclasses.replace(config, camera=plain, look=look)
     without = dataclasses.replace(config, look=dataclasses.replace(look, tissue_over_shaft=False))
@@ -155,7 +161,7 @@ def test_hidden_points_are_where_the_foreground_is_drawn() -> None:
     renderers = Renderer(world), Renderer(dataclasses.replace(world, props=build_world(without).props))
     truth = side_truth(world, "right")
     hidden, drawn = [], []
-    for i in range(4):
+    for i in range(0, 40, 10):
         with_loop, without_loop = (r.encoded("right", np.array([i]))[0].numpy() for r in renderers)
         changed = np.abs(with_loop - without_loop).max(-1) > 0.01
         uv = np.round(truth.contour_uv[i]).reshape(-1, 2)
