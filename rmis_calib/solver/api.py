@@ -21,7 +21,7 @@ from rmis_calib.solver.residuals import State, residual_rows
 from rmis_calib.solver.settings import SolverSettings
 from rmis_calib.solver.solution import MotionReason, Nuisance, Solution, SolveStatus
 from rmis_calib.solver.statistics import LineStatistics
-from rmis_calib.solver.unknowns import UNITS, initial_state
+from rmis_calib.solver.unknowns import UNITS, Nominal, initial_state
 from rmis_calib.solver.variance import assumed_noise
 
 MIN_CHEIRALITY = 0.5
@@ -79,7 +79,7 @@ def _two_step_solution(flat: Problem, R: Tensor, t: Tensor, covariance: Tensor, 
     axis_only = flat.only("axis")
     packed = pack(axis_only, settings.noise)
     noise, _ = assumed_noise(flat, settings.noise)
-    state = initial_state(axis_only, R, t)
+    state = initial_state(Nominal.of(axis_only), R, t)
     front = cheirality(packed, state, torch.ones_like(packed.line_ok[0]))
     status = torch.where(front < MIN_CHEIRALITY, SolveStatus.BEHIND_CAMERA, SolveStatus.CONVERGED)
     status = torch.where(torch.isfinite(covariance).all(-1).all(-1) & torch.isfinite(t).all(-1), status, SolveStatus.NON_FINITE)

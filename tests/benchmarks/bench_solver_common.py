@@ -15,7 +15,7 @@ from rmis_calib.solver import Problem, SolverSettings
 from rmis_calib.solver.measurements import pack
 from rmis_calib.solver.normal import accumulate
 from rmis_calib.solver.settings import UnknownSettings
-from rmis_calib.solver.unknowns import initial_state, make_layout
+from rmis_calib.solver.unknowns import Nominal, initial_state, make_layout
 from rmis_calib.solver.variance import assumed_noise
 
 KNOWN_RADIUS = UnknownSettings(radius_sigma_relative=0.0)
@@ -68,8 +68,8 @@ def study(settings: LineStudyConfig, kinds: tuple[str, ...], cameras: int = 2, u
     X = torch.as_tensor(truth["camera_right_T_arm"])
     solver = SolverSettings(unknowns=unknowns)
     packed = pack(clean, solver.noise)
-    state = replace(initial_state(clean, X[:, :3, :3], X[:, :3, 3]), end_offset=torch.full_like(X[:, 0, 0], truth["shaft_end_offset_mm"]))
-    layout = make_layout(clean, packed, state, unknowns, solver.noise)
+    state = replace(initial_state(Nominal.of(clean), X[:, :3, :3], X[:, :3, 3]), end_offset=torch.full_like(X[:, 0, 0], truth["shaft_end_offset_mm"]))
+    layout = make_layout(Nominal.of(clean), packed, state, unknowns, solver.noise)
     noise, _ = assumed_noise(clean, solver.noise)
     information = accumulate(packed, state, layout, noise, solver.chunk).H
     return Study(problem, X, torch.linalg.inv(information)[:, :6, :6])

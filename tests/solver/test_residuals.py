@@ -12,7 +12,7 @@ from rmis_calib.solver import Problem, SolverSettings
 from rmis_calib.solver.measurements import END, HEAD, LINE, pack
 from rmis_calib.solver.residuals import linearise, residual_rows
 from rmis_calib.solver.settings import UnknownSettings
-from rmis_calib.solver.unknowns import columns, initial_state, make_layout
+from rmis_calib.solver.unknowns import Nominal, columns, initial_state, make_layout
 
 EVERYTHING = UnknownSettings(rcm_offset=True, joint_offsets=True, clock=True)
 
@@ -31,7 +31,7 @@ def scene(simulate):
     )
     X = torch.as_tensor(truth["camera_right_T_arm"])
     packed = pack(problem, SolverSettings().noise)
-    state = initial_state(problem, X[:, :3, :3], X[:, :3, 3])
+    state = initial_state(Nominal.of(problem), X[:, :3, :3], X[:, :3, 3])
     return problem, packed, replace(state, end_offset=torch.full((1,), truth["shaft_end_offset_mm"], dtype=torch.float64)), truth
 
 
@@ -40,7 +40,7 @@ def test_exact_measurements_have_no_residual(simulate):
     X = torch.as_tensor(truth["camera_right_T_arm"])
     packed = pack(problem, SolverSettings().noise)
     state = replace(
-        initial_state(problem, X[:, :3, :3], X[:, :3, 3]), end_offset=torch.full((1,), truth["shaft_end_offset_mm"], dtype=torch.float64)
+        initial_state(Nominal.of(problem), X[:, :3, :3], X[:, :3, 3]), end_offset=torch.full((1,), truth["shaft_end_offset_mm"], dtype=torch.float64)
     )
     assert packed.row_kind == (LINE,) * 8 + (END,) * 2 + (HEAD,) * 4
     assert float(residual_rows(packed, state).abs().max()) < 1e-12
@@ -74,7 +74,7 @@ def test_hand_derived_line_residual():
     }  # fmt: skip
     problem = Problem.from_arrays(arrays).flatten_batch()
     packed = pack(problem, SolverSettings().noise)
-    state = initial_state(problem, torch.eye(3, dtype=torch.float64)[None], torch.tensor([[-30.0, 0.0, 100.0]], dtype=torch.float64))
+    state = initial_state(Nominal.of(problem), torch.eye(3, dtype=torch.float64)[None], torch.tensor([[-30.0, 0.0, 100.0]], dtype=torch.float64))
     assert residual_rows(packed, state)[:, 0, 0].tolist() == pytest.approx([0.01, 0.01, 0.0, 0.0], abs=1e-12)
     rows, _ = linearise(packed, state)
     slope = 100.0 * 4.0 / (100.0**2 - 16.0) ** 1.5  # d(edge)/dz
@@ -84,7 +84,7 @@ def test_hand_derived_line_residual():
 def test_jacobian_of_every_unknown_equals_autodiff(scene):
     problem, packed, state, _ = scene
     settings = SolverSettings(unknowns=EVERYTHING)
-    layout = make_layout(problem, packed, state, settings.unknowns, settings.noise)
+    layout = make_layout(Nominal.of(problem), packed, state, settings.unknowns, settings.noise)
     assert list(layout.blocks) == [
         "rotation", "translation", "stereo_rotation", "stereo_translation", "radius", "end_offset", "rcm_offset", "joint_offset", "clock",
     ]  # fmt: skip
