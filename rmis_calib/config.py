@@ -34,8 +34,8 @@ class CalibrationConfig:
     quadrature to what the detector claims for a contour or an end. Without it sharp pictures outvote the kinematics: on
     the real recording of the tests the answer is 9.8 mm from the reference, with 0.3 px 3.6 mm, with 0.7 px 2.6 mm."""
     edge_bias_px: float = 0.02
-    """Error of a contour point that every picture of a camera shares (lens model, edge detector), 1 sigma, px. It does not
-    average out: it enters the covariance, not the estimate. 0.02 px was measured on rendered pictures."""
+    """Error of a contour point that every picture of a camera shares (lens model, edge detector), 1 sigma, px. It does
+    not average out: it enters the covariance, not the estimate. 0.02 px was measured on rendered pictures."""
     min_motions: int = 6
     """Fewest motions with a usable shaft."""
     detector: DetectorSettings = field(default_factory=DetectorSettings)

@@ -260,29 +260,31 @@ def render_recording(
 
 def conclude(result: "CalibrationResult", written: Path) -> int:
     """Print the answer and where it is; the exit code says whether to trust it."""
-    print_table(f"{result.status}: {result.message}", result_rows(result))
-    console.print(f"written: {written}")
+    console.print(f"[bold]{result.status}[/bold]: {result.message}\n", soft_wrap=True)
+    print_table(result.camera_right_T_arm.name if result.camera_right_T_arm else "no transform", result_rows(result))
+    console.print(f"written: {written}\n", soft_wrap=True)
     return EXIT_OK if result.trustworthy else EXIT_NOT_TRUSTWORTHY
 
 
 def result_rows(result: "CalibrationResult") -> list[tuple[str, str]]:
     """The answer with frames, units and uncertainty."""
-    rows: list[tuple[str, str]] = [("method", result.method)]
+    rows: list[tuple[str, str]] = []
     transform = result.camera_right_T_arm
     if transform is not None:
-        matrix = "\n".join("  ".join(f"{value:10.5f}" for value in row) for row in transform.matrix.tolist())
-        rows.append((transform.name + " (mm)", matrix))
-        rows.append(("quat_wxyz", "  ".join(f"{value:.6f}" for value in transform.quat_wxyz.tolist())))
+        matrix = transform.matrix.tolist()
+        lines = ["".join(f"{x:10.6f}" for x in row[:3]) + f"{row[3]:12.4f}" for row in matrix[:3]]
+        rows.append(("rotation | translation, mm", "\n".join(lines)))
+        rows.append(("quaternion wxyz", "".join(f"{x:10.6f}" for x in transform.quat_wxyz.tolist())))
     if result.rotation_sigma_deg is not None and result.translation_sigma_mm is not None:
-        sigma = f"{result.rotation_sigma_deg:.3f} deg   {result.translation_sigma_mm:.3f} mm"
-        rows.append(("1 sigma, rotation and translation", sigma))
+        rows.append(("1 sigma", f"{result.rotation_sigma_deg:.3f} deg, {result.translation_sigma_mm:.3f} mm"))
     used, total = int(result.motions.used.sum()), len(result.motions.used)
-    rows.append(("motions used", f"{used} of {total}"))
-    rows += [(f"  rejected: {reason}", str(count)) for reason, count in result.motions.rejected_by_reason.items()]
+    rows.append(("motions used", f"{used} of {total} (method {result.method})"))
+    rows += [(f"  {count} rejected", reason) for reason, count in result.motions.rejected_by_reason.items()]
     for kind, residual in result.residuals.items():
-        rows.append((f"residual, {kind}", f"median {residual['median']:.3g} {residual['unit']}"))
+        if residual["median"] is not None:
+            rows.append((f"residual, {kind.replace('_', ' ')}", f"median {residual['median']:.3g} {residual['unit']}"))
     for name, nuisance in result.nuisances.items():
-        sigma = "held" if nuisance.get("sigma") is None else f"+- {nuisance['sigma']:.3g}"
-        rows.append((name, f"{nuisance['value']:.4g} {sigma} {nuisance['unit']}"))
-    rows += [("observability", sentence) for sentence in result.observability.get("sentences", [])]
+        sigma = "" if nuisance["sigma"] is None else f" +- {nuisance['sigma']:.2g}"
+        held = " (held by its prior)" if nuisance.get("held") else ""
+        rows.append((name.replace("_", " "), f"{nuisance['value']:.4g}{sigma} {nuisance['unit']}{held}"))
     return rows

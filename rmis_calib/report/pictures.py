@@ -12,6 +12,7 @@ from rmis_calib.geometry.cameras import Camera
 from rmis_calib.pipeline.calibration import CalibrationRun
 from rmis_calib.pipeline.detection import View
 from rmis_calib.report.overlays import DETECTED_RGB, PREDICTED_RGB, Overlay
+from rmis_calib.results import CalibrationResult
 
 _SUBPIXEL_BITS = 4
 _SAMPLES = 200
@@ -52,9 +53,17 @@ def _overlay(run: CalibrationRun, view: View, motion: int) -> Overlay:
         if bool(visible):
             _dot(canvas, uv.numpy(), PREDICTED_RGB, thickness)
     used = bool(run.result.motions.used[frame])
-    reason = run.result.motions.reasons[frame]
-    caption = f"frame {frame}: {'used' if used else 'not used'}" + (f" ({reason})" if reason else "")
-    return Overlay(frame=frame, camera=view.side, image=canvas, caption=caption, used=used)
+    return Overlay(
+        frame=frame, camera=view.side, image=canvas, caption=_caption(run.result, view.side, frame), used=used
+    )
+
+
+def _caption(result: CalibrationResult, side: str, frame: int) -> str:
+    """Why the motion was not used, or how far its contours are from the prediction."""
+    reason = result.motions.reasons[frame]
+    residual = result.residuals.get(f"contour_{side}", {"by_motion": {frame: np.nan}})["by_motion"][frame]
+    distance = f"contours {residual:.2f} px from the prediction" if np.isfinite(residual) else "not measured here"
+    return reason or distance
 
 
 def contour_polylines(contour_n: Float[Tensor, "2 3"], camera: Camera) -> Float[np.ndarray, "2 p 2"]:
