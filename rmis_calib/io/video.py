@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 import torch
@@ -70,18 +71,21 @@ class FrameSource:
 
     def _batches(self, batch_size: int, device: torch.device) -> Iterator[FrameBatch]:
         frames = self._reader.read_all()
+        # An interrupt may hit between the start of the thread and its registration, and then `shutdown` does not wait.
+        decoding = Lock()
         executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="rmis-decode")
         try:
             # Errors of the thread travel in the futures and are raised by `result`.
-            ahead = deque(executor.submit(_stack, frames, batch_size) for _ in range(_BATCHES_AHEAD))
+            ahead = deque(executor.submit(_stack, frames, batch_size, decoding) for _ in range(_BATCHES_AHEAD))
             start = 0
             while (images := ahead.popleft().result()) is not None:
-                ahead.append(executor.submit(_stack, frames, batch_size))
+                ahead.append(executor.submit(_stack, frames, batch_size, decoding))
                 yield _to_device(images, start, device)
                 start += len(images)
         finally:
             executor.shutdown(wait=True, cancel_futures=True)
-            frames.close()
+            with decoding:
+                frames.close()
 
     def frame(self, index: int) -> UInt8[Tensor, "3 height width"]:
         """One frame by number, RGB on the CPU.
@@ -125,8 +129,9 @@ def open_source(path: str | Path) -> FrameSource:
         raise VideoError(where=str(path), expected="a readable file", found=error.strerror) from error
 
 
-def _stack(frames: Iterator[np.ndarray], batch_size: int) -> np.ndarray | None:
-    batch = list(islice(frames, batch_size))
+def _stack(frames: Iterator[np.ndarray], batch_size: int, decoding: Lock) -> np.ndarray | None:
+    with decoding:
+        batch = list(islice(frames, batch_size))
     return np.stack(batch) if batch else None
 
 

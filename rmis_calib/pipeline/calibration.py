@@ -36,6 +36,7 @@ from rmis_calib.results import STATUS_SENTENCES, CalibrationResult, Motions
 from rmis_calib.solver import Solution
 
 JOINTS_UNKNOWN = "the joint log does not cover this time"
+TOO_FEW = "usable, but there are too few"
 CHOICE_ROUNDS = 3
 """Solves at most: a choice of candidates that has not settled by then alternates between equals."""
 
@@ -191,7 +192,7 @@ def _motions(
         if all(missing):
             reasons[frame] = missing[0]
         elif solved is None or solver_reasons is None:
-            reasons[frame] = ""
+            reasons[frame] = TOO_FEW
         else:
             used[frame], reasons[frame] = bool(solved[motion]), solver_reasons[motion]
     return Motions(used, tuple(reasons), recording.frame_times_s)
@@ -212,7 +213,7 @@ def _residuals_px(recording: Recording, poses: MotionPoses, solution: Solution) 
 
 
 def _insufficient(config: CalibrationConfig, motions: Motions, why: str | None = None) -> CalibrationResult:
-    usable = sum(reason == "" for reason in motions.reasons)
+    usable = sum(reason == TOO_FEW for reason in motions.reasons)
     why = why or f"{usable} of {len(motions.used)} motions are usable, {config.min_motions} are needed"
     return CalibrationResult(
         status="insufficient_data",

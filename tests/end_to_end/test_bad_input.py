@@ -108,7 +108,12 @@ DAMAGE = {
     "zero-byte video": (lambda r: (r / "left.mp4").write_bytes(b""), ["left.mp4"]),
     "not a video": (lambda r: (r / "right.mp4").write_text("hello"), ["right.mp4"]),
     "wrong frame size": (lambda r: edit_yaml(r / "stereo.yaml", image_size=[320, 240]), ["320"]),
-    "joint out of range": (lambda r: edit_cell(r / "joints.csv", 3, 1, "4.0"), ["joints.csv"]),
+    "joint beyond its limit": (
+        lambda r: edit_yaml(
+            r / "robot.yaml", arms__instrument__joints__0__min=2.0, arms__instrument__joints__0__max=3.0
+        ),
+        ["joints.csv", "instrument"],
+    ),
     "degrees for radians": (lambda r: scale_columns(r / "joints.csv", "_rad", 57.29578 * 20), ["joints.csv"]),
     "insertion in metres": (lambda r: scale_columns(r / "joints.csv", "_mm", 1e-3), ["metres"]),
     "baseline in metres": (lambda r: metres_extrinsics(r / "stereo.yaml"), ["metres"]),
