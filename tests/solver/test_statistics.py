@@ -44,7 +44,7 @@ def test_parts_add_up_to_the_whole(simulate, realistic):
     for name in ("rotation_gram", "point_gram", "turn", "count"):
         torch.testing.assert_close(getattr(merged, name), getattr(whole, name))
     a, b = find_candidates(whole, 576, 4).best(), find_candidates(merged, 576, 4).best()
-    torch.testing.assert_close(a[1], b[1], atol=1e-6, rtol=1e-8)
+    torch.testing.assert_close(a[1], b[1], atol=1e-4, rtol=0)  # descent settles to 1e-9 of the cost
 
 
 def test_parts_of_different_rigs_do_not_add(simulate):
