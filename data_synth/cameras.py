@@ -1,6 +1,7 @@
 """Pinhole camera with Brown-Conrady distortion, float64 NumPy, written apart from the calibration's own.
 
-Convention: pixel (0, 0) is the centre of the top-left pixel; uv = (column, row); normalised image coordinates are x/z, y/z.
+Convention: pixel (0, 0) is the centre of the top-left pixel; uv = (column, row); normalised image
+coordinates are x/z, y/z.
 """
 
 from __future__ import annotations
@@ -58,7 +59,8 @@ class Camera:
         return self.pixels(p[..., :2] / z)
 
     def rays(self, uv: Array) -> tuple[Array, Array]:
-        """Undistorted normalised coordinates (..., 2) seen by pixels (..., 2), and their Jacobian (..., 2, 2) by the pixel.
+        """Undistorted normalised coordinates (..., 2) seen by pixels (..., 2), and their Jacobian (..., 2, 2) by the
+        pixel.
 
         Raises:
             ValueError: the distortion cannot be inverted at one of the pixels.
@@ -78,7 +80,8 @@ class Camera:
         return xy, np.linalg.inv(jacobian) / [self.fx, self.fy]
 
     def bounds(self) -> Bounds:
-        """Largest upright rectangle about the axis that is certainly in the picture: through the middles of its sides."""
+        """Largest upright rectangle about the axis that is certainly in the picture: through the middles of its
+        sides."""
         right, bottom = self.width - 0.5, self.height - 0.5
         sides = np.array([[-0.5, self.cy], [self.cx, -0.5], [right, self.cy], [self.cx, bottom]])
         xy, _ = self.rays(sides)
@@ -96,7 +99,7 @@ class Camera:
     def contains(self, uv: Array) -> NDArray[np.bool_]:
         """Whether pixels (..., 2) are inside the picture; False for NaN."""
         with np.errstate(invalid="ignore"):
-            return ((uv >= -0.5) & (uv <= [self.width - 0.5, self.height - 0.5])).all(-1)
+            return np.all((uv >= -0.5) & (uv <= [self.width - 0.5, self.height - 0.5]), axis=-1)
 
     def to_dict(self) -> dict:
         """The camera as an entry of stereo.yaml."""

@@ -1,8 +1,10 @@
-"""Exact picture of a cylinder: contour planes, contact lines, axis, and where the shaft ends. float64 NumPy, any leading batch.
+"""Exact picture of a cylinder: contour planes, contact lines, axis, and where the shaft ends. float64 NumPy, any
+leading batch.
 
-Derivation: the tangent planes through the optical centre contain the axis direction v, so their unit normals are n = a u + b (u x v)
-with u the unit vector to the axis point nearest to the centre, at distance D; tangency n . (D u) = +-r gives a = +-r / D.
-Edge 0 is on the left of somebody who walks in the picture from the RCM to the tip, edge 1 on the right (x right, y down).
+Derivation: the tangent planes through the optical centre contain the axis direction v, so their unit normals are
+n = a u + b (u x v) with u the unit vector to the axis point nearest to the centre, at distance D; tangency
+n . (D u) = +-r gives a = +-r / D. Edge 0 is on the left of somebody who walks in the picture from the RCM to the tip,
+edge 1 on the right (x right, y down).
 """
 
 from __future__ import annotations
@@ -68,7 +70,8 @@ def visible_interval(
     bounds: tuple[float, float, float, float],
     near_mm: float = 5.0,
 ) -> tuple[Array, Array]:
-    """Part of the axis that is in the picture: coordinates s (...,), (...,); empty where the first is not below the second.
+    """Part of the axis that is in the picture: coordinates s (...,), (...,); empty where the first is not below the
+    second.
 
     Args:
         p_axis: (..., 3) axis point at s = 0, camera frame, mm.

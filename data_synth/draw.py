@@ -33,7 +33,8 @@ class RayMap:
 
 @dataclass(frozen=True)
 class InstrumentPoses:
-    """An instrument in one camera: axis point at s = 0, direction, side of the jaws (B, R, 3); coordinates of ends (B, R); float64, mm.
+    """An instrument in one camera: axis point at s = 0, direction, side of the jaws (B, R, 3); coordinates of ends (B,
+    R); float64, mm.
 
     R is 1, or the number of groups of rows that are read at different times.
     """
@@ -58,7 +59,8 @@ class Brush:
 
 
 def gather_pixels(brush: Brush, planes: Tensor) -> tuple[Tensor, Pixels]:
-    """Flat indices (M,) into (B, H, W), and the pixels, on the positive side of all planes (B, R, P, 3) or a margin outside.
+    """Flat indices (M,) into (B, H, W), and the pixels, on the positive side of all planes (B, R, P, 3) or a margin
+    outside.
 
     The planes' (x, y) parts are unit: values are distances in normalised coordinates.
     """

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F
+import torch.nn.functional as nnf
 from torch import Tensor
 
 from data_synth.draw import Brush, gather_pixels
@@ -74,5 +74,5 @@ def _outline(loop: LoopPoses) -> Tensor:
 def _sample_scattered(texture: Tensor, grid: Tensor) -> Tensor:
     """Bilinear samples (M, 3) at scattered positions (M, 2)."""
     count = len(grid)
-    padded = F.pad(grid, (0, 0, 0, -count % SAMPLE_COLUMNS))
+    padded = nnf.pad(grid, (0, 0, 0, -count % SAMPLE_COLUMNS))
     return sample_texture(texture, padded.view(1, -1, SAMPLE_COLUMNS, 2)).reshape(-1, 3)[:count]

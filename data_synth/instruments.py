@@ -1,7 +1,10 @@
-"""Pictures of instruments by analytic ray casting: every edge is an exact error function of its distance in pixels. torch, float32.
+"""Pictures of instruments by analytic ray casting: every edge is an exact error function of its distance in pixels.
+torch, float32.
 
-How an edge is defined: colours are mixed in encoded values, so the geometric edge is where the *encoded* picture is half way
-between its two sides. (Mixing linear light and encoding afterwards would move a dark-to-bright edge by a fraction of the blur.)
+How an edge is defined: colours are mixed in encoded values, so the geometric edge is where the *encoded* picture is
+half way
+between its two sides. (Mixing linear light and encoding afterwards would move a dark-to-bright edge by a fraction of
+the blur.)
 """
 
 from __future__ import annotations
@@ -17,7 +20,8 @@ FACING_LIMIT = 0.35
 
 @dataclass(frozen=True)
 class Pixels:
-    """Gathered pixels, M of them: ray (M, 2) in normalised coordinates, its Jacobian (M, 4) by the pixel, and their picture (M,)."""
+    """Gathered pixels, M of them: ray (M, 2) in normalised coordinates, its Jacobian (M, 4) by the pixel, and their
+    picture (M,)."""
 
     xy: Tensor
     jacobian: Tensor
@@ -42,7 +46,8 @@ class Cylinders:
 
 
 def make_cylinders(p_axis: Tensor, v_axis: Tensor, light: Tensor) -> Cylinders:
-    """Cylinders about lines through p (K, 3) along unit v (K, 3), float64 in and float32 out; light (K, 3) in camera coordinates."""
+    """Cylinders about lines through p (K, 3) along unit v (K, 3), float64 in and float32 out; light (K, 3) in camera
+    coordinates."""
     s_foot = -(p_axis * v_axis).sum(-1)
     foot = p_axis + s_foot[:, None] * v_axis
     distance = foot.norm(dim=-1)
@@ -53,7 +58,8 @@ def make_cylinders(p_axis: Tensor, v_axis: Tensor, light: Tensor) -> Cylinders:
 
 
 def dot3(a: Tensor, b: Tensor) -> Tensor:
-    """Scalar products (...) of vectors (..., 3). Written out: torch's reductions over three values take ten times as long."""
+    """Scalar products (...) of vectors (..., 3). Written out: torch's reductions over three values take ten times as
+    long."""
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
 
 
@@ -109,7 +115,8 @@ def hit_cylinder(pixels: Pixels, cylinders: Cylinders, radius: float, blur_px: f
     length = torch.sqrt(nu * nu + nw * nw).clamp_min(1e-6)
     nu, nw = nu / length, nw / length
     s = cylinders.s_foot[pixels.pose] + t * dv
-    # Towards the limb s runs ever faster across the picture and its slope no longer tells a distance: held from there on.
+    # Towards the limb s runs ever faster across the picture and its slope no longer tells a distance: held from there
+    # on.
     facing = torch.clamp(nu * du + nw * dw, max=-FACING_LIMIT)
     slide = -dv / facing  # implicit derivative of the hit along the surface
     gx, gy = (t * (slide * (nu * frame[:, 0, i] + nw * frame[:, 1, i]) + frame[:, 2, i]) for i in range(2))

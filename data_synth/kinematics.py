@@ -1,6 +1,7 @@
 """Forward kinematics of the synthetic robot: Denavit-Hartenberg tables in float64 NumPy.
 
-Written apart from the calibration's own kinematics on purpose: truth that is made with the code under test proves nothing.
+Written apart from the calibration's own kinematics on purpose: truth that is made with the code under test proves
+nothing.
 Convention: `a_T_b` maps coordinates in b to coordinates in a; millimetres and radians.
 """
 
@@ -13,7 +14,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
+"""float64 unless the docstring says otherwise."""
 Convention = Literal["modified", "standard"]
 
 
@@ -54,7 +56,8 @@ def transform_points(a_T_b: Array, b_p: Array) -> Array:
 
 
 def pose_noise(generator: np.random.Generator, shape: tuple[int, ...], sigma_rad: float, sigma_mm: float) -> Array:
-    """Random small transforms (*shape, 4, 4): rotation exp(sigma_rad * eps), translation sigma_mm * eps, eps standard normal per axis."""
+    """Random small transforms (*shape, 4, 4): rotation exp(sigma_rad * eps), translation sigma_mm * eps, eps standard
+    normal per axis."""
     eps = generator.standard_normal((*shape, 6))
     return rigid(rotation_from_rotvec(sigma_rad * eps[..., :3]), sigma_mm * eps[..., 3:])
 
@@ -73,7 +76,8 @@ def random_rotations(generator: np.random.Generator, shape: tuple[int, ...]) -> 
 
 @dataclass(frozen=True)
 class Joint:
-    """One row of a Denavit-Hartenberg table; the reading plus `offset` is added to theta (revolute) or d (prismatic)."""
+    """One row of a Denavit-Hartenberg table; the reading plus `offset` is added to theta (revolute) or d
+    (prismatic)."""
 
     name: str
     kind: Literal["revolute", "prismatic"]
@@ -117,7 +121,8 @@ class Arm:
     head_xyz_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def frames(self, readings: ArrayLike) -> Array:
-        """Poses (..., J + 1, 4, 4) in base of the arm's base (frame 0) and of the frame after each joint, from readings (..., J)."""
+        """Poses (..., J + 1, 4, 4) in base of the arm's base (frame 0) and of the frame after each joint, from readings
+        (..., J)."""
         values = np.asarray(readings, dtype=np.float64)
         base_T_frame = np.broadcast_to(self.base_T_arm_base, (*values.shape[:-1], 4, 4))
         frames = [base_T_frame]
@@ -142,7 +147,8 @@ class Arm:
 
 @dataclass(frozen=True)
 class Shaft:
-    """Where an instrument's shaft is: RCM pose (..., 4, 4), axis and head point in rcm (..., 3), nominal end along the axis (...), mm."""
+    """Where an instrument's shaft is: RCM pose (..., 4, 4), axis and head point in rcm (..., 3), nominal end along the
+    axis (...), mm."""
 
     base_T_rcm: Array
     rcm_v_axis: Array

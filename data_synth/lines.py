@@ -17,16 +17,18 @@ SHORTEST_VISIBLE_MM = 10.0
 
 
 def simulate_lines(config: LineStudyConfig) -> dict[str, Any]:
-    """Observations of `config.trials` independent trials in the keys of an observations file, each with a leading trials axis.
+    """Observations of `config.trials` independent trials in the keys of an observations file, each with a leading
+    trials axis.
 
-    Noise: the given `arm_T_rcm` is the true one right-multiplied by (exp(eps), eps); each camera sees the true pose of the RCM frame,
-    right-multiplied in the same way and independently (`camera_noise_*`); the given stereo extrinsics are the true ones right-multiplied
-    once a trial; then every image point gets isotropic Gaussian noise.
+    Noise: the given `arm_T_rcm` is the true one right-multiplied by (exp(eps), eps); each camera sees the true pose of
+    the RCM frame, right-multiplied in the same way and independently (`camera_noise_*`); the given stereo extrinsics
+    are the true ones right-multiplied once a trial; then every image point gets isotropic Gaussian noise.
 
     Returns:
-        arrays (trials, N, ...) and scalars, plus `truth`: camera_right_T_arm (trials, 4, 4), camera_left_T_camera_right (trials, 4, 4),
-        arm_T_rcm (trials, N, 4, 4) without noise, camera_right_T_rcm and camera_left_T_rcm (trials, N, 4, 4) as the pictures see them, and
-        shaft_end_offset_mm. Rows that are not in the picture are NaN and not valid.
+        arrays (trials, N, ...) and scalars, plus `truth`: camera_right_T_arm (trials, 4, 4), camera_left_T_camera_right
+        (trials, 4, 4), arm_T_rcm (trials, N, 4, 4) without noise, camera_right_T_rcm and camera_left_T_rcm
+        (trials, N, 4, 4) as the pictures see them, and shaft_end_offset_mm. Rows that are not in the picture are NaN
+        and not valid.
     """
     generator = np.random.default_rng(config.seed)
     scene = build_scene(config.scene)
@@ -50,11 +52,8 @@ def simulate_lines(config: LineStudyConfig) -> dict[str, Any]:
         "rcm_p_head": np.broadcast_to(poses.rcm_p_head, (trials, n, 3)).copy(),
         "camera_left_T_camera_right": stereo @ noise((trials,), "stereo"),
         "shaft_radius_mm": scene.shaft_radius_mm,
-        "sigma_image": config.pixel_noise_px / config.focal_px,
     }
-    for source in ("kinematics", "camera", "stereo"):
-        out[f"sigma_{source}_mm"] = getattr(config, f"{source}_noise_mm")
-        out[f"sigma_{source}_rad"] = float(np.deg2rad(getattr(config, f"{source}_noise_deg")))
+    out |= _sigmas(config)
     out |= _measure(config, scene, seen_right, poses, generator, "right")
     out |= _measure(config, scene, seen_left, poses, generator, "left")
     out["truth"] = {
@@ -66,6 +65,15 @@ def simulate_lines(config: LineStudyConfig) -> dict[str, Any]:
         "shaft_end_offset_mm": scene.shaft_end_offset_mm,
     }
     return out
+
+
+def _sigmas(config: LineStudyConfig) -> dict[str, float]:
+    """The noise as an observations file states it."""
+    sigmas = {"sigma_image": config.pixel_noise_px / config.focal_px}
+    for source in ("kinematics", "camera", "stereo"):
+        sigmas[f"sigma_{source}_mm"] = getattr(config, f"{source}_noise_mm")
+        sigmas[f"sigma_{source}_rad"] = float(np.deg2rad(getattr(config, f"{source}_noise_deg")))
+    return sigmas
 
 
 def _true_poses(config: LineStudyConfig, scene: Scene, generator: np.random.Generator) -> Poses:
@@ -99,7 +107,8 @@ def _hand_eye(config: LineStudyConfig, scene: Scene, generator: np.random.Genera
 def _measure(
     config: LineStudyConfig, scene: Scene, camera_T_rcm: Array, poses: Poses, generator: np.random.Generator, side: str
 ) -> dict[str, Array]:
-    """What one camera measures: two points on the axis and on each contour, the shaft's end, the head point; RCM side first."""
+    """What one camera measures: two points on the axis and on each contour, the shaft's end, the head point; RCM side
+    first."""
     p_axis = camera_T_rcm[..., :3, 3]
     v_axis = np.einsum("...ij,...j->...i", camera_T_rcm[..., :3, :3], np.broadcast_to(poses.rcm_v_axis, p_axis.shape))
     half_width, half_height = config.half_width_px / config.focal_px, config.half_height_px / config.focal_px

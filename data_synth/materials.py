@@ -22,7 +22,8 @@ BLOOD = (0.11, 0.004, 0.004)
 
 @dataclass(frozen=True)
 class Surface:
-    """Linear reflectance, strength and sharpness of the highlight, a pattern, the share under blood, and the glare stripe's strength."""
+    """Linear reflectance, strength and sharpness of the highlight, a pattern, the share under blood, and the glare
+    stripe's strength."""
 
     reflectance: tuple[float, float, float]
     highlight: float
@@ -75,12 +76,14 @@ def light_cylinder(hit: Hit, light: Tensor, surface: Surface, gamma: float) -> T
     half = unit3(to_light - unit3(hit.point))
     nu, nw = hit.normal[:, 0], hit.normal[:, 1]
     diffuse = torch.clamp(nu * to_light[:, 0] + nw * to_light[:, 1], min=0.0)
-    # A turned tube has fine grooves round it: they spread the highlight along the axis, so only the angle round it counts.
+    # A turned tube has fine grooves round it: they spread the highlight along the axis, so only the angle round it
+    # counts.
     across = torch.sqrt(half[:, 0] ** 2 + half[:, 1] ** 2).clamp_min(1e-3)
     mirror = torch.clamp((nu * half[:, 0] + nw * half[:, 1]) / across, min=0.0)
     highlight = surface.highlight * across * mirror**surface.sharpness
     reflectance = torch.tensor(surface.reflectance, device=diffuse.device).expand(len(diffuse), 3)
-    # The square of the cosine fades in proportion to the distance from the limb; the cosine itself would fade like its root,
+    # The square of the cosine fades in proportion to the distance from the limb; the cosine itself would fade like its
+    # root,
     # within a pixel, and so move the visible edge (measured: 0.03 px against 0.01 px).
     body = 0.7 + 0.3 * diffuse * diffuse
     if surface.pattern != "plain":

@@ -80,7 +80,8 @@ def plan_path(
         scene: for the home positions.
         frames: number of frames.
         generator: source of randomness.
-        in_view: whether the shaft's end is in view at readings (n, 3), (n, 3); used by `random` when `keep_end_in_view`.
+        in_view: whether the shaft's end is in view at readings (n, 3), (n, 3); used by `random` when
+            `keep_end_in_view`.
     """
     arm_half = 0.5 * np.array([np.deg2rad(settings.rotation_range_deg)] * 2 + [settings.translation_range_mm])
     half_range = np.concatenate([arm_half * (settings.laparoscope == "moving"), arm_half])

@@ -1,4 +1,5 @@
-"""Configurations from YAML: presets by name, files, or mappings. Unknown and repeated keys and impossible values are refused."""
+"""Configurations from YAML: presets by name, files, or mappings. Unknown and repeated keys and impossible values are
+refused."""
 
 from __future__ import annotations
 

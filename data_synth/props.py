@@ -49,7 +49,8 @@ class Props:
 
 
 def place_props(look: LookSettings, base_T_camera_home: Array, generator: np.random.Generator) -> Props:
-    """Other instruments from the left and from below, and a loop that reaches over the shaft, as the home camera sees them."""
+    """Other instruments from the left and from below, and a loop that reaches over the shaft, as the home camera sees
+    them."""
     ports = np.array([[-85.0, -35.0, 25.0], [-20.0, 95.0, 30.0]])
     heads = np.array([[-30.0, 8.0, 104.0], [-2.0, 30.0, 112.0]])
 
@@ -73,7 +74,8 @@ def place_props(look: LookSettings, base_T_camera_home: Array, generator: np.ran
 
 
 def hidden_by(loop: TissueLoop, camera_T_base: Array, camera_p: Array) -> Array:
-    """Whether points (..., 3) in the camera are behind the loop: the ray to them passes nearer to its axis than its radius."""
+    """Whether points (..., 3) in the camera are behind the loop: the ray to them passes nearer to its axis than its
+    radius."""
     a = transform_points(camera_T_base, loop.base_p_a)
     e = transform_points(camera_T_base, loop.base_p_b) - a
     d = camera_p / np.linalg.norm(camera_p, axis=-1, keepdims=True)

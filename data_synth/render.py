@@ -1,4 +1,5 @@
-"""Pictures of a world: tissue, instruments, light, smoke, and the camera's ways. Draws with torch on any device; truth is made elsewhere."""
+"""Pictures of a world: tissue, instruments, light, smoke, and the camera's ways. Draws with torch on any device; truth
+is made elsewhere."""
 
 from __future__ import annotations
 
@@ -6,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-import torch.nn.functional as F
+import torch.nn.functional as nnf
 from torch import Tensor
 
 from data_synth.cameras import Camera
@@ -32,7 +33,8 @@ SMOKE_SPEED = np.array([0.11, -0.07])
 
 @dataclass(frozen=True)
 class _View:
-    """A camera's fixed maps on the device: rays of all pixels, of the coarse nodes (h, w, 3), and the light that passes (H, W, 1)."""
+    """A camera's fixed maps on the device: rays of all pixels, of the coarse nodes (h, w, 3), and the light that passes
+    (H, W, 1)."""
 
     camera: Camera
     rays: RayMap
@@ -167,9 +169,9 @@ class Renderer:
         v, u = np.meshgrid(np.linspace(-0.5, 0.5, rows), np.linspace(-0.5, 0.5, columns), indexing="ij")
         grid = np.stack([u, v], axis=-1) + (SMOKE_SPEED * times[:, None])[:, None, None]
         smoke = self._smoke.expand(len(times), -1, -1, -1)
-        density = F.grid_sample(smoke, self._tensor(grid), padding_mode="reflection", align_corners=False)
+        density = nnf.grid_sample(smoke, self._tensor(grid), padding_mode="reflection", align_corners=False)
         full = ((rows - 1) * COARSE_PX + 1, (columns - 1) * COARSE_PX + 1)
-        density = F.interpolate(density, size=full, mode="bilinear", align_corners=True)[
+        density = nnf.interpolate(density, size=full, mode="bilinear", align_corners=True)[
             :, 0, : self.size[0], : self.size[1], None
         ]
         picture.lerp_(torch.tensor(SMOKE_COLOUR, device=self.device), self.look.smoke * density)

@@ -1,7 +1,9 @@
-"""The operating scene: two arms that pivot about their remote centres of motion, and the transform that a calibration must find.
+"""The operating scene: two arms that pivot about their remote centres of motion, and the transform that a calibration
+must find.
 
 Every number of the geometry is in `SceneSettings` (settings.py); here they become DH tables and exact float64 poses.
-Frames: `base`, `arm` (end of the laparoscope's arm), `rcm` (the instrument's remote centre of motion), `camera_right`, `camera_left`.
+Frames: `base`, `arm` (end of the laparoscope's arm), `rcm` (the instrument's remote centre of motion), `camera_right`,
+`camera_left`.
 """
 
 from __future__ import annotations
@@ -50,7 +52,8 @@ class Scene:
 
 
 def _rcm_joints(insertion_offset_mm: float) -> tuple[Joint, ...]:
-    """Yaw, pitch and insertion through one point: the z axis of the last frame is the shaft and passes through the origin of frame 0."""
+    """Yaw, pitch and insertion through one point: the z axis of the last frame is the shaft and passes through the
+    origin of frame 0."""
     return (
         Joint("yaw", "revolute", HALF_PI, 0.0, 0.0, 0.0, HALF_PI),
         Joint("pitch", "revolute", -HALF_PI, 0.0, 0.0, 0.0, -HALF_PI),
@@ -85,33 +88,8 @@ def build_scene(settings: SceneSettings) -> Scene:
     base_T_camera_home = rigid(
         rotation_from_rotvec(np.deg2rad(settings.camera_home_rotvec_deg)), settings.camera_home_translation_mm
     )
-    # Laparoscope: last DH frame on the optical axis, 20 mm behind the camera, so that `end_T_tool` is not the identity.
-    camera_T_end = rigid(rotation_from_rotvec([0.0, 0.0, 0.6]), [0.0, 0.0, -20.0])
-    laparoscope_joints = _rcm_joints(insertion_offset_mm=15.0)
-    laparoscope_home = np.array([0.10, -0.15, settings.laparoscope_rcm_behind_mm - 20.0 - 15.0])
-    laparoscope = Arm(
-        base_T_arm_base=_place_arm(laparoscope_joints, laparoscope_home, base_T_camera_home @ camera_T_end),
-        joints=laparoscope_joints,
-        end_T_tool=rigid_inverse(camera_T_end) @ camera_right_T_arm,
-    )
-    # Instrument: last DH frame at the head point (the axis of the claspers), on the shaft's axis.
-    camera_p_rcm = np.asarray(settings.instrument_rcm_mm, dtype=np.float64)
-    camera_v_axis = np.asarray(settings.target_mm, dtype=np.float64) - camera_p_rcm
-    depth_mm = float(np.linalg.norm(camera_v_axis))
-    camera_T_head = rigid(_frame_along(camera_v_axis, roll_rad=-0.9), settings.target_mm)
-    head_beyond_end_frame_mm = 4.0
-    instrument_joints = _rcm_joints(insertion_offset_mm=-30.0)
-    instrument_home = np.array([-0.20, 0.12, depth_mm - head_beyond_end_frame_mm + 30.0])
-    end_T_head = rigid(np.eye(3), [0.0, 0.0, head_beyond_end_frame_mm])
-    base_T_end = base_T_camera_home @ camera_T_head @ rigid_inverse(end_T_head)
-    instrument = Arm(
-        base_T_arm_base=_place_arm(instrument_joints, instrument_home, base_T_end),
-        joints=instrument_joints,
-        rcm_frame=0,
-        shaft_frame=3,
-        head_frame=3,
-        head_xyz_mm=(0.0, 0.0, head_beyond_end_frame_mm),
-    )
+    laparoscope, laparoscope_home = _laparoscope(settings, base_T_camera_home, camera_right_T_arm)
+    instrument, instrument_home = _instrument(settings, base_T_camera_home)
     return Scene(
         laparoscope=laparoscope,
         instrument=instrument,
@@ -127,9 +105,35 @@ def build_scene(settings: SceneSettings) -> Scene:
     )
 
 
+def _laparoscope(settings: SceneSettings, base_T_camera_home: Array, camera_T_arm: Array) -> tuple[Arm, Array]:
+    """The laparoscope's arm and its home readings. Its last DH frame is on the optical axis, 20 mm behind the camera,
+    so that `end_T_tool` is not the identity."""
+    camera_T_end = rigid(rotation_from_rotvec([0.0, 0.0, 0.6]), [0.0, 0.0, -20.0])
+    joints = _rcm_joints(insertion_offset_mm=15.0)
+    home = np.array([0.10, -0.15, settings.laparoscope_rcm_behind_mm - 20.0 - 15.0])
+    base_T_arm_base = _place_arm(joints, home, base_T_camera_home @ camera_T_end)
+    return Arm(base_T_arm_base, joints, end_T_tool=rigid_inverse(camera_T_end) @ camera_T_arm), home
+
+
+def _instrument(settings: SceneSettings, base_T_camera_home: Array) -> tuple[Arm, Array]:
+    """The instrument's arm and its home readings. The head point (the axis of the claspers) is on the shaft's axis, a
+    little beyond the last DH frame."""
+    camera_p_rcm = np.asarray(settings.instrument_rcm_mm, dtype=np.float64)
+    camera_v_axis = np.asarray(settings.target_mm, dtype=np.float64) - camera_p_rcm
+    head_beyond_end_mm = 4.0
+    camera_T_head = rigid(_frame_along(camera_v_axis, roll_rad=-0.9), settings.target_mm)
+    end_T_head = rigid(np.eye(3), [0.0, 0.0, head_beyond_end_mm])
+    joints = _rcm_joints(insertion_offset_mm=-30.0)
+    home = np.array([-0.20, 0.12, float(np.linalg.norm(camera_v_axis)) - head_beyond_end_mm + 30.0])
+    base_T_arm_base = _place_arm(joints, home, base_T_camera_home @ camera_T_head @ rigid_inverse(end_T_head))
+    head = (0.0, 0.0, head_beyond_end_mm)
+    return Arm(base_T_arm_base, joints, rcm_frame=0, shaft_frame=3, head_frame=3, head_xyz_mm=head), home
+
+
 @dataclass(frozen=True)
 class Poses:
-    """What the joint readings say (...: any batch): poses (..., 4, 4), axis and head point (..., 3), nominal shaft end (...), mm."""
+    """What the joint readings say (...: any batch): poses (..., 4, 4), axis and head point (..., 3), nominal shaft end
+    (...), mm."""
 
     base_T_arm: Array
     arm_T_rcm: Array
@@ -149,7 +153,8 @@ def poses_at(scene: Scene, laparoscope_readings: Array, instrument_readings: Arr
 
 @dataclass(frozen=True)
 class ShaftInCamera:
-    """One shaft seen from one camera: points on the axis at coordinate s are camera_p_rcm + s camera_v_axis; (..., 3) and (...), mm."""
+    """One shaft seen from one camera: points on the axis at coordinate s are camera_p_rcm + s camera_v_axis; (..., 3)
+    and (...), mm."""
 
     camera_p_rcm: Array
     camera_v_axis: Array

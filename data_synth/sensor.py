@@ -1,11 +1,12 @@
-"""What the camera's electronics do to an encoded picture: drift, sharpening, Bayer pattern, noise, compression. torch, float32."""
+"""What the camera's electronics do to an encoded picture: drift, sharpening, Bayer pattern, noise, compression. torch,
+float32."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 import torch
-import torch.nn.functional as F
+import torch.nn.functional as nnf
 from torch import Tensor
 
 from data_synth.kinematics import Array
@@ -65,7 +66,7 @@ class Sensor:
         """Noise of red and blue with a coarse grain; green takes the opposite, so that the brightness stays."""
         small = torch.Size((shape[0], shape[1] // 4 + 1, shape[2] // 4 + 1, 2))
         coarse = self._noise(small, generators, self.settings.colour_noise_levels).movedim(-1, 1)
-        red_blue = F.interpolate(coarse, size=shape[1:3], mode="bilinear", align_corners=False).movedim(1, -1)
+        red_blue = nnf.interpolate(coarse, size=shape[1:3], mode="bilinear", align_corners=False).movedim(1, -1)
         green = -(0.30 * red_blue[..., 0] + 0.11 * red_blue[..., 1]) / 0.59
         return torch.stack([red_blue[..., 0], green, red_blue[..., 1]], dim=-1)
 
@@ -74,9 +75,9 @@ def _sharpen(picture: Tensor, strength: float) -> Tensor:
     """Unsharp mask: symmetric, so a straight edge keeps its place."""
     x = picture.movedim(-1, 1)
     kernel = x.new_tensor([1.0, 4.0, 6.0, 4.0, 1.0]) / 16.0
-    blurred = F.pad(x, (2, 2, 2, 2), mode="replicate")
-    blurred = F.conv2d(blurred, kernel.view(1, 1, 1, 5).expand(3, 1, 1, 5), groups=3)
-    blurred = F.conv2d(blurred, kernel.view(1, 1, 5, 1).expand(3, 1, 5, 1), groups=3)
+    blurred = nnf.pad(x, (2, 2, 2, 2), mode="replicate")
+    blurred = nnf.conv2d(blurred, kernel.view(1, 1, 1, 5).expand(3, 1, 1, 5), groups=3)
+    blurred = nnf.conv2d(blurred, kernel.view(1, 1, 5, 1).expand(3, 1, 5, 1), groups=3)
     return (x + strength * (x - blurred)).movedim(1, -1).contiguous()
 
 
@@ -89,7 +90,7 @@ def _mosaic(picture: Tensor) -> Tensor:
     plus = x.new_tensor([[0.0, 0.25, 0.0], [0.25, 1.0, 0.25], [0.0, 0.25, 0.0]])
     kernel = torch.stack([cross, plus, cross])[:, None]
     # Mirrored about the border pixel, the pattern keeps its colours.
-    return F.conv2d(F.pad(x * keep, (1, 1, 1, 1), mode="reflect"), kernel, groups=3).movedim(1, -1).contiguous()
+    return nnf.conv2d(nnf.pad(x * keep, (1, 1, 1, 1), mode="reflect"), kernel, groups=3).movedim(1, -1).contiguous()
 
 
 def _jpeg(pictures: Tensor, quality: int) -> Tensor:
@@ -98,5 +99,5 @@ def _jpeg(pictures: Tensor, quality: int) -> Tensor:
     decoded = []
     for picture in pictures.cpu().numpy():
         _, data = cv2.imencode(".jpg", picture[..., ::-1], options)
-        decoded.append(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1])
+        decoded.append(np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))[..., ::-1])
     return torch.from_numpy(np.stack(decoded)).to(pictures.device)

@@ -1,4 +1,5 @@
-"""Settings of the synthetic scenes. Unknown keys and impossible values are refused; every field says its unit in its name."""
+"""Settings of the synthetic scenes. Unknown keys and impossible values are refused; every field says its unit in its
+name."""
 
 from __future__ import annotations
 
@@ -56,7 +57,8 @@ class LineStudyConfig:
     seed: int = 0
     """Seed of all noise."""
     motion: Literal["grid", "random"] = "grid"
-    """`grid`: positions_laparoscope^3 * positions_instrument^3 motions; `random`: `random_motions` uniform draws, other ones each trial."""
+    """`grid`: positions_laparoscope^3 * positions_instrument^3 motions; `random`: `random_motions` uniform draws, other
+    ones each trial."""
     positions_laparoscope: Count = 3
     """Positions a joint of the laparoscope (1: it stands still)."""
     positions_instrument: Count = 4
@@ -104,7 +106,8 @@ class MotionSettings:
     translation_range_mm: NonNegative = 20.0
     """Full range of the prismatic joints."""
     positions_laparoscope: Count = 3
-    """Grid positions a joint of the laparoscope; a seeded choice of the grid when it has more places than there are motions."""
+    """Grid positions a joint of the laparoscope; a seeded choice of the grid when it has more places than there are
+    motions."""
     positions_instrument: Count = 3
     """Grid positions a joint of the instrument."""
     stop_period_s: Positive = 0.5
@@ -124,7 +127,8 @@ class NoiseSettings:
     """How far the log is from the truth. Defaults: a well-calibrated robot."""
 
     kinematics_mm: NonNegative = 0.1
-    """Translation noise of the instrument's pose against the joints, per axis and motion: the seen arm_T_rcm is the logged one, right-multiplied."""
+    """Translation noise of the instrument's pose against the joints, per axis and motion: the seen arm_T_rcm is the
+    logged one, right-multiplied."""
     kinematics_deg: NonNegative = 0.03
     """Rotational part of the same."""
     joint_reading_deg: NonNegative = 0.0

@@ -60,7 +60,8 @@ class CameraSettings:
     readout_s: NonNegative = 0.0
     """Time from reading the first row to the last (rolling shutter); the middle row is read at the frame's time."""
     field_delay_s: NonNegative = 0.0
-    """Interlaced: odd rows are taken this long after the even ones, half before and half after the frame's time; 0: not so."""
+    """Interlaced: odd rows are taken this long after the even ones, half before and half after the frame's time; 0: not
+    so."""
     sharpening: NonNegative = 0.0
     """Strength of the video processor's unsharp mask: halos along edges."""
     bayer: bool = False
@@ -108,7 +109,8 @@ class LookSettings:
     wrist_radius_ratio: Annotated[float, Field(gt=0.3, le=1.0)] = 0.94
     """Radius of the metal wrist over that of the shaft."""
     other_instruments: Annotated[tuple[Literal["metal", "dark", "white"], ...], Field(max_length=2)] = ()
-    """Further instruments that no joint is logged for: all metal, dark shaft with metal wrist, dark with a white tip."""
+    """Further instruments that no joint is logged for: all metal, dark shaft with metal wrist, dark with a white
+    tip."""
     tissue_over_shaft: bool = False
     """A loop of tissue in the foreground hides a part of the shaft."""
     absent_fraction: Fraction = 0.0

@@ -13,7 +13,7 @@ from data_synth.settings_picture import LookSettings
 PALETTES = {
     "mixed": ((0.46, 0.11, 0.085), (0.66, 0.29, 0.23)),
     "liver": ((0.23, 0.040, 0.035), (0.34, 0.070, 0.055)),
-    "bowel": ((0.62, 0.31, 0.26), (0.80, 0.50, 0.43)),
+    "bowel": ((0.66, 0.29, 0.24), (0.84, 0.50, 0.43)),
 }
 """Two linear reflectances between which each kind of tissue varies."""
 FAT, VESSEL, BLOOD, PALE = (0.86, 0.50, 0.11), (0.26, 0.03, 0.035), (0.16, 0.006, 0.006), (0.70, 0.46, 0.32)
@@ -32,7 +32,7 @@ def filtered_noise(generator: np.random.Generator, size: int, low: float, high: 
     spectrum = np.zeros((size, size // 2 + 1), dtype=np.complex64)
     spectrum[rows[:, None] % size, columns[None]] = band * waves
     spectrum[0, 0] = 0.0
-    field = scipy.fft.irfft2(spectrum, s=(size, size))
+    field = np.asarray(scipy.fft.irfft2(spectrum, s=(size, size)))
     return field / field.std()
 
 
@@ -52,7 +52,8 @@ def upper_share(field: Array, share: float, softness: float) -> Array:
 
 @dataclass(frozen=True)
 class Texture:
-    """Linear reflectance (S, S, 3), height (S, S) mm, coarse height (S, S) mm without the fine grain, and gloss (S, S)."""
+    """Linear reflectance (S, S, 3), height (S, S) mm, coarse height (S, S) mm without the fine grain, and gloss (S,
+    S)."""
 
     colour: Array
     height: Array

@@ -1,4 +1,5 @@
-"""Exact contours, axis, end and head point in every frame, from poses alone: no drawing code takes part. float64 NumPy."""
+"""Exact contours, axis, end and head point in every frame, from poses alone: no drawing code takes part. float64
+NumPy."""
 
 from __future__ import annotations
 
@@ -18,9 +19,11 @@ SHORTEST_VISIBLE_MM = 5.0
 
 @dataclass(frozen=True)
 class SideTruth:
-    """What one camera sees of the instrument in N frames; `xy` is normalised undistorted, `uv` raw pixels. NaN where not visible.
+    """What one camera sees of the instrument in N frames; `xy` is normalised undistorted, `uv` raw pixels. NaN where
+    not visible.
 
-    Edge 0 is on the left of somebody who walks in the picture from the RCM to the tip; of two points the RCM side comes first.
+    Edge 0 is on the left of somebody who walks in the picture from the RCM to the tip; of two points the RCM side comes
+    first.
 
     Attributes:
         camera_T_rcm: (N, 4, 4) true pose of the RCM frame.

@@ -1,4 +1,5 @@
-"""Everything that is true of one synthetic recording: scene, cameras, motion, and the poses at any time. float64 NumPy."""
+"""Everything that is true of one synthetic recording: scene, cameras, motion, and the poses at any time. float64
+NumPy."""
 
 from __future__ import annotations
 
@@ -57,7 +58,8 @@ class World:
         return base_T_camera_right @ rigid_inverse(self.camera_T_camera_right(side))
 
     def shaft(self, side: str, frames: Array, times_s: Array) -> tuple[ShaftInCamera, Array]:
-        """The instrument in a camera, and camera_T_rcm (..., 4, 4), at times (...); `frames` (...) chooses the noise of the pose."""
+        """The instrument in a camera, and camera_T_rcm (..., 4, 4), at times (...); `frames` (...) chooses the noise of
+        the pose."""
         laparoscope, instrument = self.path.at(times_s)
         poses = poses_at(self.scene, laparoscope, instrument)
         camera_right_T_rcm = self.scene.camera_right_T_arm @ poses.arm_T_rcm @ self.rcm_noise[frames]
@@ -68,7 +70,8 @@ class World:
         return replace(shaft, s_end_mm=shaft.s_end_mm - withdrawn, camera_p_head=head), camera_T_rcm
 
     def in_sight(self, side: str, camera_T_base: Array, camera_p: Array) -> NDArray[np.bool_]:
-        """Whether points (..., 3) of the instrument are seen: inside the picture and its bright field, not behind foreground tissue."""
+        """Whether points (..., 3) of the instrument are seen: inside the picture and its bright field, not behind
+        foreground tissue."""
         camera, settings = self.cameras[side], self.config.camera
         uv = camera.project(camera_p)
         seen = camera.contains(uv)

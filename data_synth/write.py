@@ -40,7 +40,8 @@ def write_recording(
 ) -> Path:
     """Render a recording into a new folder, with ground_truth.yaml and truth.npz.
 
-    The folder is made under a temporary name beside its place and renamed when complete; an interrupted run leaves nothing.
+    The folder is made under a temporary name beside its place and renamed when complete; an interrupted run leaves
+    nothing.
 
     Args:
         path: folder to make.
@@ -96,8 +97,8 @@ def _write_tables(folder: Path, world: World, truths: dict[str, SideTruth]) -> N
     _write_csv(folder / "frame_times.csv", ["frame", "timestamp_s"], times)
     _write_head_points(folder / "head_points.csv", world, truths, generator)
     _write_yaml(folder / "ground_truth.yaml", ground_truth(world) | {"joint_offsets": offsets})
-    arrays = {f"{side}_{key}": value for side, truth in truths.items() for key, value in truth.arrays().items()}
-    np.savez_compressed(folder / "truth.npz", frame_times_s=world.frame_times_s, **arrays)
+    arrays: dict[str, Any] = {f"{side}_{key}": value for side, t in truths.items() for key, value in t.arrays().items()}
+    np.savez_compressed(folder / "truth.npz", **arrays, frame_times_s=world.frame_times_s)
 
 
 def ground_truth(world: World) -> dict[str, Any]:

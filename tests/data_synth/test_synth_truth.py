@@ -18,7 +18,8 @@ from data_synth.truth import SideTruth, side_truth
 from data_synth.world import World, build_world
 
 TOLERANCE_PX = 0.02
-"""How well drawn edges must lie where the truth says; measured: at most 0.012 px, the fading of the shaft towards its limb."""
+"""How well drawn edges must lie where the truth says; measured: at most 0.012 px, the fading of the shaft towards its
+limb."""
 
 
 @pytest.fixture(scope="module", params=["clean", "barrel"])
@@ -133,7 +134,8 @@ def test_drawn_contours_and_ends_are_where_the_truth_is(world: World, side: str)
 
 
 def end_error(picture: np.ndarray, truth: SideTruth, i: int) -> float:
-    """Signed distance along the axis of the drawn end from the true front of the rim, by a fit to pixels near the axis."""
+    """Signed distance along the axis of the drawn end from the true front of the rim, by a fit to pixels near the
+    axis."""
     at, head = truth.end_front_uv[i], truth.head_uv[i]
     d = (head - at) / np.linalg.norm(head - at)
     v, u = np.mgrid[0 : picture.shape[0], 0 : picture.shape[1]]
