@@ -11,9 +11,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rmis_calib.vision.lens import Lens
 from rmis_calib.vision.runs import masked_median
-from rmis_calib.vision.sampling import inside, sample
+from rmis_calib.vision.sampling import FullPicture
 from rmis_calib.vision.strips import Strips
 
 # Blurs tried, in steps of the profile: from sharper than a pixel to soft motion blur.
@@ -62,8 +61,7 @@ def interpolate(values: Float[Tensor, "b k 2 s"], t: Float[Tensor, " s"], at: Fl
 
 
 def _read_bands(
-    image: Float[Tensor, "b 3 h w"],
-    lens: Lens,
+    picture: FullPicture,
     strips: Strips,
     t: Float[Tensor, "b k p"],
     lateral: Float[Tensor, "b k 2 p"],
@@ -73,8 +71,8 @@ def _read_bands(
     outward = lateral.new_tensor([1.0, -1.0])[:, None, None]
     y = lateral[..., None] + outward * offsets[:, :, :, None, :]
     ideal = strips.points(t[:, :, None, :, None].expand_as(y), y)
-    raw = lens.to_raw(ideal)
-    return sample(image, raw), inside(raw, (image.shape[-2], image.shape[-1])).all(-1)
+    colours, seen = picture.read(ideal)
+    return colours, seen.all(-1)
 
 
 def _project(colours: Float[Tensor, "b k 2 p d 3"], use: Bool[Tensor, "b k 2 p"]) -> Float[Tensor, "b k 2 p d"]:
@@ -101,8 +99,7 @@ def _steepest(profile: Float[Tensor, "b k 2 p d"]) -> tuple[Float[Tensor, "b k 2
 
 
 def rough(
-    image: Float[Tensor, "b 3 h w"],
-    lens: Lens,
+    picture: FullPicture,
     strips: Strips,
     t: Tensor,
     lateral: Tensor,
@@ -111,7 +108,7 @@ def rough(
 ) -> EdgePoints:
     """Steepest rise within eight steps of the traced contour; its softness sets the step of `fine`."""
     offsets = torch.arange(-8, 9, device=t.device, dtype=t.dtype) * step_px[..., None]
-    colours, seen = _read_bands(image, lens, strips, t, lateral, offsets)
+    colours, seen = _read_bands(picture, strips, t, lateral, offsets)
     seen &= use
     profile = _project(colours, seen)
     place, slope = _steepest(profile)
@@ -123,8 +120,7 @@ def rough(
 
 
 def fine(
-    image: Float[Tensor, "b 3 h w"],
-    lens: Lens,
+    picture: FullPicture,
     strips: Strips,
     t: Float[Tensor, "b k p"],
     lateral: Float[Tensor, "b k 2 p"],
@@ -133,7 +129,7 @@ def fine(
 ) -> EdgePoints:
     """Place of a blurred step in each profile, by linear least squares around `lateral`."""
     offsets = torch.arange(-6, 7, device=t.device, dtype=t.dtype)
-    colours, seen = _read_bands(image, lens, strips, t, lateral, offsets * step_px[..., None])
+    colours, seen = _read_bands(picture, strips, t, lateral, offsets * step_px[..., None])
     seen &= use
     profile = _project(colours, seen)
     blur = _mean_blur(profile, seen, offsets)

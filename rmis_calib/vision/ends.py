@@ -7,8 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rmis_calib.vision.edges import step_estimator
-from rmis_calib.vision.lens import Lens
-from rmis_calib.vision.sampling import inside, sample
+from rmis_calib.vision.sampling import FullPicture
 from rmis_calib.vision.strips import Strips
 
 _ROWS = 11
@@ -28,8 +27,7 @@ class ShaftEnd:
 
 
 def locate(
-    image: Float[Tensor, "b 3 h w"],
-    lens: Lens,
+    picture: FullPicture,
     strips: Strips,
     coarse_t: Float[Tensor, "b k"],
     width: Float[Tensor, "b k"],
@@ -47,9 +45,8 @@ def locate(
     contour = strips.contour(t)
     rows = torch.linspace(-0.5 * _REACH, 0.5 * _REACH, _ROWS, device=t.device)
     y = contour.mean(2)[:, :, None] + (contour[:, :, 0] - contour[:, :, 1])[:, :, None] * rows[:, None]
-    raw = lens.to_raw(strips.points(t[:, :, None].expand_as(y), y))  # (b, k, rows, n, 2)
-    seen = inside(raw, (image.shape[-2], image.shape[-1])).all(2)
-    colours = sample(image, raw)
+    colours, seen = picture.read(strips.points(t[:, :, None].expand_as(y), y))  # (b, k, rows, n, 3)
+    seen = seen.all(2)
     profile = _separate(colours, seen)
     index, rise, found = _first_rise(profile.mean(2), seen)
     shift, agreement = _refine(profile, index, (blur_px / step).clamp(0.5, 3.0))

@@ -4,10 +4,11 @@ Contours are straight only after undistortion. The picture itself is never resam
 ideal pixels, lines live there, and samples are read at the raw pixel that belongs to an ideal one.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rmis_calib.geometry import Camera
@@ -18,8 +19,9 @@ class Lens:
     """Raw <-> ideal <-> normalised coordinates; without a camera, all three are pixels."""
 
     camera: Camera | None
+    _copies: dict[tuple[torch.dtype, torch.device], Camera] = field(default_factory=dict, compare=False, repr=False)
 
-    @property
+    @cached_property
     def distorts(self) -> bool:
         """Whether raw and ideal pixels differ."""
         return self.camera is not None and bool(torch.any(self.camera.distortion != 0))
@@ -29,11 +31,18 @@ class Lens:
         """Mean focal length; 1 without a camera, so that normalised units are pixels."""
         return 1.0 if self.camera is None else float(self.camera.focal)
 
+    def _like(self, points: Tensor, camera: Camera) -> Camera:
+        """The camera in the points' precision and on their device, converted once."""
+        key = (points.dtype, points.device)
+        if key not in self._copies:
+            self._copies[key] = camera.to(dtype=points.dtype, device=points.device)
+        return self._copies[key]
+
     def _intrinsics(self, like: Tensor) -> tuple[Tensor, Tensor]:
         if self.camera is None:
             return like.new_ones(2), like.new_zeros(2)
-        focal = torch.stack([self.camera.fx, self.camera.fy]).to(like)
-        return focal, torch.stack([self.camera.cx, self.camera.cy]).to(like)
+        camera = self._like(like, self.camera)
+        return torch.stack([camera.fx, camera.fy]), torch.stack([camera.cx, camera.cy])
 
     def normalise(self, ideal: Float[Tensor, "*points 2"]) -> Float[Tensor, "*points 2"]:
         """Ideal pixels to normalised undistorted coordinates (x/z, y/z)."""
@@ -44,13 +53,18 @@ class Lens:
         """Ideal pixels to raw pixels."""
         if self.camera is None or not self.distorts:
             return ideal
-        camera = self.camera.to(dtype=ideal.dtype, device=ideal.device)
-        return camera.pixels(self.normalise(ideal))
+        return self._like(ideal, self.camera).pixels(self.normalise(ideal))
 
     def to_ideal(self, raw: Float[Tensor, "*points 2"]) -> Float[Tensor, "*points 2"]:
         """Raw pixels to ideal pixels; NaN where the distortion has no inverse."""
         if self.camera is None or not self.distorts:
             return raw
         focal, centre = self._intrinsics(raw)
-        xy, valid = self.camera.to(dtype=raw.dtype, device=raw.device).undistort_points(raw)
+        xy, valid = self._like(raw, self.camera).undistort_points(raw)
         return torch.where(valid[..., None], xy * focal + centre, torch.nan)
+
+    def is_regular(self, ideal: Float[Tensor, "*points 2"]) -> Bool[Tensor, "*points"]:
+        """Whether the distortion is one-to-one out to these points; beyond, raw pixels mean something else."""
+        if self.camera is None or not self.distorts:
+            return torch.ones_like(ideal[..., 0], dtype=torch.bool)
+        return self._like(ideal, self.camera).can_distort(self.normalise(ideal))

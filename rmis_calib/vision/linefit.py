@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-_ITERATIONS = 12
+_ITERATIONS = 9
 _BLOCKS = 12
 
 
@@ -57,7 +57,7 @@ def fit_lines(
         z = residual / scale[..., None]
         tukey = (1 - (z / 4.7).square()).clamp(min=0.0).square()
         huber = 1.3 / z.abs().clamp(min=1.3)
-        robust = weight * (huber * trusted if step < 5 else tukey)
+        robust = weight * (huber * trusted if step < 4 else tukey)
     inliers = robust.sum(-1).square() / robust.square().sum(-1).clamp(min=1e-9)
     scatter = ((robust * residual.square()).sum(-1) / robust.sum(-1).clamp(min=1e-9)).sqrt().clamp(min=floor_px)
     independent = scatter * (2.0 / inliers.clamp(min=3.0)).sqrt()

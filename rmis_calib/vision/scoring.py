@@ -10,7 +10,7 @@ from rmis_calib.vision.runs import first_on, last_on, masked_mean, masked_median
 from rmis_calib.vision.settings import DetectorSettings
 from rmis_calib.vision.strips import SmallPicture, Strips
 
-_STATIONS = 128
+_STATIONS = 96
 _INNER, _RIM = 7, 4
 MAX_BRIGHTER = 0.55
 """Log brightness by which the inside of a shaft may exceed its surroundings. Slate-grey shafts on dark liver reach 0.3;
@@ -100,7 +100,7 @@ def inspect(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -
     """Find the stretch of each strip that is a shaft, and turn the strip so that it runs towards the tip."""
     t = torch.linspace(-1, 1, _STATIONS, device=strips.offset.device) * picture.half_diagonal_px
     spacing = float(t[1] - t[0])
-    p = _profiles(picture, strips, t, settings.min_width_fraction * picture.image_size[1])
+    p = _profiles(picture, strips, t, settings.min_width_fraction * picture.width_px)
     on = p.open & (p.step > settings.min_contrast) & (p.inner < p.outer - 0.5 * settings.min_contrast)
     tone = masked_median(p.inner, on)
     surround = masked_median(p.outer, on)

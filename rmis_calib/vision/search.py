@@ -1,18 +1,18 @@
 """Coarse search: from a batch of pictures to a few strips a frame that may be shafts."""
 
-import math
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from rmis_calib.vision import hough, scoring, shaft_mask, strips, trace
-from rmis_calib.vision.lens import Lens
+from rmis_calib.vision.canvas import Canvas, shrink
 from rmis_calib.vision.settings import DetectorSettings
 
-_LINES, _PAIRS = 48, 96
+_LINES, _PAIRS = 40, 32
+# Blurred ridges of the field's border reach this far into it, small px.
+_RIM_PX = 4
 # A ridge below this is texture: 3 per cent of brightness a small pixel.
 _MIN_GRADIENT = 0.03
 
@@ -32,28 +32,29 @@ class Stages:
 
 
 def search(
-    images: Tensor, lens: Lens, settings: DetectorSettings, count: int
+    images: Tensor, canvas: Canvas, settings: DetectorSettings, count: int
 ) -> tuple[trace.Trace, Float[Tensor, "b c"], Stages]:
     """The best `count` strips of each frame with their contours traced, their scores, and the stages that led there.
 
     Args:
         images: (b, 3, H, W), uint8 or floating point in [0, 1].
-        lens: raw <-> ideal pixels.
+        canvas: the small picture's place.
         settings: limits of width, contrast, convergence.
         count: strips wanted a frame.
     """
-    height, width = images.shape[-2:]
-    factor = max(1, round(width / settings.small_width_px))
-    rgb = shaft_mask.shrink(images, factor)
-    seen = shaft_mask.field_of_view(rgb, settings.black_level)
+    small = shrink(images, canvas.factor)
+    field, within = shaft_mask.field_of_view(small, settings.black_level, _RIM_PX)
+    stack = torch.cat([small, field[:, None].to(small.dtype), within[:, None].to(small.dtype)], 1)
+    stack = canvas.lay_out(stack)
+    rgb, seen, well_inside = stack[:, :3], stack[:, 3] > 0.5, stack[:, 4] > 0.99
+    if canvas.covered is not None:
+        seen, well_inside = seen & canvas.covered, well_inside & canvas.covered
     unlike, tone = shaft_mask.unlikeness(rgb, seen)
-    ridge, edges = _edges(unlike, seen, lens, factor, (height, width))
-    reach = 0.5 * math.hypot(height, width)
-    votes = hough.vote(edges, images.shape[0], reach / factor + 2)
+    ridge, edges = _edges(unlike, well_inside)
+    votes = hough.vote(edges, images.shape[0], canvas.half_diagonal_px / canvas.factor + 2)
     lines = hough.peaks(votes, _LINES)
-    layers = torch.stack([unlike, seen.to(unlike.dtype), tone], 1)
-    picture = strips.SmallPicture(layers, factor, (height, width), lens, reach)
-    lines = strips.snap(picture, hough.HoughLines(lines.normal, lines.rho * factor, lines.votes))
+    picture = strips.SmallPicture(torch.stack([unlike, seen.to(unlike.dtype), tone], 1), canvas, images.shape[-1])
+    lines = strips.snap(picture, hough.HoughLines(lines.normal, lines.rho * canvas.factor, lines.votes))
     evidence = scoring.inspect(picture, strips.pair(lines, picture, settings, _PAIRS), settings)
     scores = scoring.score(evidence, settings)
     index, best = scoring.distinct(evidence, scores, count)
@@ -64,33 +65,16 @@ def search(
 
 
 def _edges(
-    unlike: Float[Tensor, "b h w"], seen: Bool[Tensor, "b h w"], lens: Lens, factor: int, image_size: tuple[int, int]
+    unlike: Float[Tensor, "b h w"], well_inside: Bool[Tensor, "b h w"]
 ) -> tuple[Bool[Tensor, "b h w"], hough.EdgePixels]:
-    """Thin ridges of the gradient that lie well inside the field of view, in ideal small pixels from the centre."""
-    gradient = hough.gradients(unlike)
-    magnitude = gradient.norm(dim=1)
-    within = max_pool2d((~seen)[:, None].to(unlike.dtype), 7, 1, 3)[:, 0] < 0.5
-    ridge = hough.thin(magnitude, gradient) & (magnitude > _MIN_GRADIENT) & within
+    """Thin ridges of the gradient inside the field of view, in small pixels from the middle of the canvas."""
+    gu, gv = hough.gradients(unlike)
+    magnitude = torch.sqrt(gu * gu + gv * gv)
+    ridge = hough.thin(magnitude, gu, gv) & (magnitude > _MIN_GRADIENT) & well_inside
     frame, row, column = ridge.nonzero(as_tuple=True)
-    raw = (torch.stack([column, row], -1).to(unlike.dtype) + 0.5) * factor - 0.5
-    strength = magnitude[frame, row, column]
-    normal = torch.stack([gradient[frame, 0, row, column], gradient[frame, 1, row, column]], -1) / strength[:, None]
-    centre = raw.new_tensor([(image_size[1] - 1) / 2, (image_size[0] - 1) / 2])
-    ideal = raw
-    if lens.distorts:
-        ideal, normal = _straighten(raw, normal, lens)
-        kept = torch.isfinite(ideal).all(-1)
-        frame, ideal, normal, strength = frame[kept], ideal[kept], normal[kept], strength[kept]
-    uv = (ideal - centre) / factor
+    at = (frame * unlike.shape[1] + row) * unlike.shape[2] + column
+    strength = magnitude.flatten()[at]
+    normal = torch.stack([gu.flatten()[at], gv.flatten()[at]], -1) / strength[:, None]
+    middle = strength.new_tensor([(unlike.shape[2] - 1) / 2, (unlike.shape[1] - 1) / 2])
+    uv = torch.stack([column, row], -1).to(strength.dtype) - middle
     return ridge, hough.EdgePixels(frame, uv, normal, strength / (strength + 0.15))
-
-
-def _straighten(
-    raw: Float[Tensor, "m 2"], normal: Float[Tensor, "m 2"], lens: Lens
-) -> tuple[Float[Tensor, "m 2"], Float[Tensor, "m 2"]]:
-    """Edge pixels and normals in ideal pixels; a normal is turned with the edge that it stands on."""
-    tangent = torch.stack([-normal[:, 1], normal[:, 0]], -1)
-    ideal = lens.to_ideal(raw)
-    direction = lens.to_ideal(raw + tangent) - ideal
-    direction = direction / direction.norm(dim=-1, keepdim=True).clamp(min=1e-6)
-    return ideal, torch.stack([direction[:, 1], -direction[:, 0]], -1)

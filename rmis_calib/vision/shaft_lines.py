@@ -10,10 +10,12 @@ from torch import Tensor
 from rmis_calib.errors import ShapeError
 from rmis_calib.geometry import Camera, axis_from_contours, plane_normal_from_points
 from rmis_calib.vision import edges, ends
+from rmis_calib.vision.canvas import Canvas, plan_canvas
 from rmis_calib.vision.lens import Lens
 from rmis_calib.vision.linefit import LineFit, fit_lines
 from rmis_calib.vision.reasons import FrameReason
 from rmis_calib.vision.runs import masked_median, smooth_over
+from rmis_calib.vision.sampling import FullPicture
 from rmis_calib.vision.search import Stages, search
 from rmis_calib.vision.settings import DetectorSettings
 from rmis_calib.vision.strips import Strips
@@ -71,6 +73,7 @@ class ShaftDetector:
         """
         self.settings = settings or DetectorSettings()
         self.lens = Lens(camera)
+        self._canvases: dict[tuple[tuple[int, int], torch.device], Canvas] = {}
 
     def detect(self, images: Tensor) -> ShaftDetections:
         """Shafts of each picture.
@@ -87,11 +90,21 @@ class ShaftDetector:
         """Shafts, and what each stage of the coarse search saw. Arguments and errors as in `detect`."""
         self._check(images)
         with torch.no_grad():
-            pixels = images.to(torch.float32) / 255.0 if images.dtype == torch.uint8 else images.to(torch.float32)
-            broken = ~torch.isfinite(pixels).flatten(1).all(1)
-            pixels = torch.nan_to_num(pixels, nan=0.0, posinf=0.0, neginf=0.0)
-            trace, scores, stages = search(pixels, self.lens, self.settings, self.settings.max_shafts)
-            return self._measure(pixels, trace, scores, stages, broken), stages
+            broken = torch.zeros(images.shape[0], dtype=torch.bool, device=images.device)
+            if images.dtype != torch.uint8:
+                broken = ~torch.isfinite(images).flatten(1).all(1)
+                images = torch.nan_to_num(images.to(torch.float32), nan=0.0, posinf=0.0, neginf=0.0)
+            trace, scores, stages = search(images, self._canvas(images), self.settings, self.settings.max_shafts)
+            return self._measure(images.contiguous(), trace, scores, stages, broken), stages
+
+    def _canvas(self, images: Tensor) -> Canvas:
+        """The small picture's place, planned once for each size and device."""
+        size = (images.shape[2], images.shape[3])
+        key = (size, images.device)
+        if key not in self._canvases:
+            factor = max(1, round(size[1] / self.settings.small_width_px))
+            self._canvases[key] = plan_canvas(size, factor, self.lens, images.device)
+        return self._canvases[key]
 
     def _check(self, images: Tensor) -> None:
         where = "images"
@@ -107,43 +120,47 @@ class ShaftDetector:
             raise ShapeError(where=where, expected=f"(height, width) of the camera, {camera.image_size}", found=size)
 
     def _measure(
-        self, pixels: Tensor, trace: Trace, scores: Float[Tensor, "b k"], stages: Stages, broken: Bool[Tensor, " b"]
+        self, images: Tensor, found: Trace, scores: Float[Tensor, "b k"], stages: Stages, broken: Bool[Tensor, " b"]
     ) -> ShaftDetections:
         """Sub-pixel contours, axis and end of the traced strips."""
-        floor = self.settings.sigma_floor_px
-        points, fit = self._contours(pixels, trace)
+        keep = (scores > 0) & ~broken[:, None]
+        if not bool(keep.any()):
+            keep = torch.zeros_like(keep).index_fill(0, torch.tensor([0], device=keep.device), True)
+        picture = FullPicture(images, keep.nonzero()[:, 0][None], self.lens)
+        trace = found.listed(keep)
+        points, fit = self._contours(picture, trace)
         strips = replace(trace.strips, offset=fit.offset, slope=fit.slope)
-        end = ends.locate(pixels, self.lens, strips, trace.end, trace.width, points.blur_px.mean(-1), 5 * floor)
-        offered = edges.at_stations(
-            trace.sides, trace.t, edges.place_samples(trace.on, trace.t, self.settings.edge_samples)
-        )
+        floor = 5 * self.settings.sigma_floor_px
+        end = ends.locate(picture, strips, trace.end, trace.width, points.blur_px.mean(-1), floor)
+        offered = edges.at_stations(trace.sides, trace.t, points.t)
         share = (fit.inliers / offered.sum(-1).clamp(min=1)).amin(-1)
-        confidence = _confidence(trace, fit, share, math.hypot(*pixels.shape[-2:]))
-        cylinder = (fit.slope[..., 0] - fit.slope[..., 1]).abs() < math.tan(
-            math.radians(self.settings.max_convergence_deg)
-        )
-        clear = cylinder & (share > 0.15) & (scores > 0) & (fit.spread_t.amin(-1) > 0)
-        valid = clear & (confidence >= self.settings.min_confidence) & ~broken[:, None]
-        order = torch.where(valid, confidence, -1.0).sort(dim=1, descending=True, stable=True).indices
-        reason = _reason(stages, scores, clear, valid, broken)
-        found = self._assemble(trace, strips, points, fit, end, valid, confidence, reason)
-        return _reorder(found, order)
+        confidence = _confidence(trace, fit, share, math.hypot(*images.shape[-2:]))
+        convergence = (fit.slope[..., 0] - fit.slope[..., 1]).abs()
+        cylinder = convergence < math.tan(math.radians(self.settings.max_convergence_deg))
+        clear = cylinder & (share > 0.15) & (scores[keep] > 0) & (fit.spread_t.amin(-1) > 0)
+        valid = clear & (confidence >= self.settings.min_confidence)
+        measured = self._assemble(trace, strips, points, fit, end, valid, confidence)
+        reason = _reason(stages, scores, _spread(clear, keep), _spread(valid, keep), broken)
+        fields = {name: _spread(value, keep) for name, value in measured.items()}
+        dense = ShaftDetections(reason=reason, **fields)
+        order = torch.where(dense.valid, dense.confidence, -1.0).sort(dim=1, descending=True, stable=True).indices
+        return _reorder(dense, order)
 
-    def _contours(self, pixels: Tensor, trace: Trace) -> tuple[edges.EdgePoints, LineFit]:
+    def _contours(self, picture: FullPicture, trace: Trace) -> tuple[edges.EdgePoints, LineFit]:
         """Edge points found roughly, then finely, and the lines through them."""
-        settings, lens, strips = self.settings, self.lens, trace.strips
+        settings, strips = self.settings, trace.strips
         t = edges.place_samples(trace.on, trace.t, settings.edge_samples)
         lateral = edges.interpolate(trace.lateral, trace.t, t)
-        step = torch.full_like(strips.offset, max(1.0, pixels.shape[-1] / settings.small_width_px / 3))
+        step = torch.full_like(strips.offset, max(1.0, picture.images.shape[-1] / settings.small_width_px / 3))
         both = t[:, :, None].expand_as(lateral)
         use = edges.at_stations(trace.sides, trace.t, t)
-        points = edges.rough(pixels, lens, strips, t, lateral, use, step)
+        points = edges.rough(picture, strips, t, lateral, use, step)
         main = edges.at_stations(trace.main[:, :, None], trace.t, t).expand_as(both)
         line = fit_lines(both, points.lateral, points.valid.to(t.dtype), main, 0.01)
         straight = line.offset[..., None] + line.slope[..., None] * both
         near = points.valid & ((points.lateral - straight).abs() < 4 * line.scatter_px[..., None])
         centre = straight + smooth_over(points.lateral - straight, near)
-        points = edges.fine(pixels, lens, strips, t, centre, use, (points.blur_px / 1.3).clamp(1.0, 4.0))
+        points = edges.fine(picture, strips, t, centre, use, (points.blur_px / 1.3).clamp(1.0, 4.0))
         usual = masked_median(points.height, points.valid)[..., None].clamp(min=1e-6)
         weight = points.valid * (points.height / usual).clamp(0.3, 1.5)
         return points, fit_lines(both, points.lateral, weight, main, 0.01)
@@ -157,8 +174,8 @@ class ShaftDetector:
         end: ends.ShaftEnd,
         valid: Bool[Tensor, "b k"],
         confidence: Float[Tensor, "b k"],
-        reason: Int[Tensor, " b"],
-    ) -> ShaftDetections:
+    ) -> dict[str, Tensor]:
+        """The fields of `ShaftDetections`, but for the reason."""
         focal = self.lens.focal_px
         along = torch.stack([fit.centre_t - fit.spread_t, fit.centre_t + fit.spread_t], -1)  # (b, k, 2, 2)
         lateral = fit.offset[..., None] + fit.slope[..., None] * along
@@ -173,9 +190,8 @@ class ShaftDetector:
         sigma = (fit.sigma_px.square() + self.settings.sigma_floor_px**2).sqrt() / focal
         known = trace.start_at_border & ~trace.end_at_border
         end_valid = end.valid & valid & ~trace.end_at_border
-        return ShaftDetections(
+        return dict(
             valid=valid,
-            reason=reason,
             contour_xy=_only(valid, contour),
             contour_sigma=_only(valid, sigma),
             axis_xy=_only(valid, axis),
@@ -193,6 +209,14 @@ class ShaftDetector:
 
     def _normalised(self, ideal: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
         return self.lens.normalise(ideal)
+
+
+def _spread(listed: Tensor, keep: Bool[Tensor, "b k"]) -> Tensor:
+    """Values of listed strips, (1, m, ...), at their frames and ranks, (b, k, ...); false or NaN elsewhere."""
+    empty = False if listed.dtype == torch.bool else torch.nan
+    dense = torch.full((*keep.shape, *listed.shape[2:]), empty, dtype=listed.dtype, device=listed.device)
+    dense[keep] = listed[0]
+    return dense
 
 
 def _only(mask: Bool[Tensor, "b k"], value: Float[Tensor, "b k ..."]) -> Float[Tensor, "b k ..."]:
@@ -237,8 +261,10 @@ def _confidence(trace: Trace, fit: LineFit, share: Float[Tensor, "b k"], reach_p
 
 def _reason(stages: Stages, scores: Tensor, clear: Tensor, valid: Tensor, broken: Tensor) -> Int[Tensor, " b"]:
     """The furthest stage that each frame reached."""
-    flat = torch.where(stages.seen, stages.unlike, torch.nan).flatten(1)
-    spread = torch.nan_to_num(flat.nanquantile(0.99, 1) - flat.nanquantile(0.01, 1))
+    weight = stages.seen.to(stages.unlike.dtype)
+    total = weight.sum((1, 2)).clamp(min=1.0)
+    mean = (stages.unlike * weight).sum((1, 2)) / total
+    spread = ((stages.unlike - mean[:, None, None]).square() * weight).sum((1, 2)) / total
     evidence = stages.evidence
     reason = torch.full_like(scores[:, 0], FrameReason.AMBIGUOUS, dtype=torch.int64)
     for failed, why in (
@@ -246,7 +272,7 @@ def _reason(stages: Stages, scores: Tensor, clear: Tensor, valid: Tensor, broken
         (~(scores > 0).any(1), FrameReason.TOO_SHORT),
         (~(evidence.on.any(-1) & evidence.strips.valid).any(1), FrameReason.NOT_A_CYLINDER),
         (~evidence.strips.valid.any(1), FrameReason.NO_STRAIGHT_EDGES),
-        ((spread < 0.1) | ~stages.seen.flatten(1).any(1), FrameReason.NO_PICTURE),
+        ((spread < 0.02**2) | ~stages.seen.flatten(1).any(1), FrameReason.NO_PICTURE),
         (broken, FrameReason.BAD_PIXELS),
     ):
         reason = torch.where(failed, int(why), reason)

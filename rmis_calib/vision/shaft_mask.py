@@ -7,9 +7,8 @@ brightness, so that the same step counts as much in a corner without light as in
 
 import torch
 from jaxtyping import Bool, Float
-from kornia.filters import gaussian_blur2d
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate
+from torch.nn.functional import interpolate, pad
 
 # Below this brightness (fraction of full scale) ratios drown in sensor noise.
 _TONE_FLOOR = 0.06
@@ -19,27 +18,17 @@ _TINT_WEIGHT = 2.0
 _BORDER_ROWS = 24
 
 
-def shrink(images: Tensor, factor: int) -> Float[Tensor, "b c h w"]:
-    """Area average over blocks, in [0, 1], single precision; the remainder at right and below is cut.
-
-    Args:
-        images: (b, c, H, W), uint8 or floating point in [0, 1].
-        factor: side of a block, px.
-    """
-    scale = 1.0 / 255.0 if images.dtype == torch.uint8 else 1.0
-    values = images.to(torch.float32)
-    return avg_pool2d(values, factor) * scale if factor > 1 else values * scale
-
-
 def scene_tint(rgb: Float[Tensor, "b 3 h w"], seen: Bool[Tensor, "b h w"]) -> Float[Tensor, "b h w"]:
     """How much of the scene's own colour a pixel has: 0 for grey, up to about 1; half of the chroma for other hues."""
     red, green, blue = rgb.unbind(1)
     value = rgb.amax(1) + _TONE_FLOOR
-    chroma = torch.stack([red - green, 0.5 * (red + green) - blue], 1) / value[:, None]
-    weight = seen[:, None].to(rgb.dtype)
-    mean = (chroma * weight).sum((2, 3)) / weight.sum((2, 3)).clamp(min=1.0)
-    direction = mean / mean.norm(dim=1, keepdim=True).clamp(min=1e-3)
-    return 0.5 * (chroma.norm(dim=1) + torch.einsum("bchw,bc->bhw", chroma, direction))
+    warm, yellow = (red - green) / value, (0.5 * (red + green) - blue) / value
+    weight = seen.to(rgb.dtype)
+    total = weight.sum((1, 2)).clamp(min=1.0)
+    mean_warm, mean_yellow = (warm * weight).sum((1, 2)) / total, (yellow * weight).sum((1, 2)) / total
+    size = torch.sqrt(mean_warm.square() + mean_yellow.square()).clamp(min=1e-3)
+    along = warm * (mean_warm / size)[:, None, None] + yellow * (mean_yellow / size)[:, None, None]
+    return 0.5 * (torch.sqrt(warm * warm + yellow * yellow) + along)
 
 
 def unlikeness(
@@ -48,18 +37,32 @@ def unlikeness(
     """Low on a dark neutral shaft, higher on everything around it: log brightness plus the scene's tint.
 
     Returns:
-        the sum, in which a step of 0.1 is a tenth in brightness, and log brightness alone.
+        the sum, in which a step of 0.1 is a tenth in brightness, and log brightness alone, both smoothed.
     """
-    smooth = gaussian_blur2d(rgb, (7, 7), (1.4, 1.4))
-    tone = (smooth.amax(1) + _TONE_FLOOR).log()
-    return tone + _TINT_WEIGHT * scene_tint(smooth, seen), tone
+    tone = smooth((rgb.amax(1) + _TONE_FLOOR).log())
+    return tone + _TINT_WEIGHT * smooth(scene_tint(rgb, seen)), tone
 
 
-def field_of_view(rgb: Float[Tensor, "b 3 h w"], black_level: float) -> Bool[Tensor, "b h w"]:
+def smooth(picture: Float[Tensor, "b h w"]) -> Float[Tensor, "b h w"]:
+    """Binomial blur of 1.4 px. Sums of neighbours: a tenth of the time of a convolution here (7 ms against 0.6 ms)."""
+    blurred = pad(picture[:, None], (4, 4, 4, 4), mode="replicate")[:, 0]
+    for _ in range(8):
+        blurred = blurred[:, :, 1:] + blurred[:, :, :-1]
+    for _ in range(8):
+        blurred = blurred[:, 1:] + blurred[:, :-1]
+    return blurred * (1.0 / 65536.0)
+
+
+def field_of_view(
+    rgb: Float[Tensor, "b 3 h w"], black_level: float, margin: int
+) -> tuple[Bool[Tensor, "b h w"], Bool[Tensor, "b h w"]]:
     """The convex part of the picture that light reaches: without black borders and outside of a round field of view.
 
     Per row, black pixels are cut from the left and from the right; the cuts are then made convex, so that a black shaft
     that enters from the border does not bend the border.
+
+    Returns:
+        the field, and the field without a rim of `margin` pixels along black borders.
     """
     height, width = rgb.shape[-2:]
     lit = rgb.amax(1) > black_level
@@ -72,9 +75,15 @@ def field_of_view(rgb: Float[Tensor, "b 3 h w"], black_level: float) -> Bool[Ten
     bottom = torch.where(empty, -1, rows).amax(-1)
     left = _convex(torch.where(empty, torch.inf, first))
     right = -_convex(torch.where(empty, torch.inf, -last))
-    across = (columns >= left[..., None]) & (columns <= right[..., None])
-    down = (rows >= top[:, None]) & (rows <= bottom[:, None])
-    return across & down[..., None]
+    field = []
+    for rim in (0, margin):
+        # The border of the picture itself is no edge of the field: nothing is cut there.
+        low, high = left + rim * (left > 0), right - rim * (right < width - 1)
+        first_row, last_row = top + rim * (top > 0), bottom - rim * (bottom < height - 1)
+        across = (columns >= low[..., None]) & (columns <= high[..., None])
+        down = (rows >= first_row[:, None]) & (rows <= last_row[:, None])
+        field.append(across & down[..., None])
+    return field[0], field[1]
 
 
 def _convex(extent: Float[Tensor, "b h"]) -> Float[Tensor, "b h"]:

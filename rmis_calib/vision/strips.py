@@ -10,38 +10,39 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from rmis_calib.vision.canvas import Canvas
 from rmis_calib.vision.hough import HoughLines
-from rmis_calib.vision.lens import Lens
 from rmis_calib.vision.sampling import inside, sample
 from rmis_calib.vision.settings import DetectorSettings
 
 
 @dataclass(frozen=True, eq=False)
 class SmallPicture:
-    """The small picture and how to read it at full-resolution ideal pixels."""
+    """The small picture of a batch, and how to read it at full-resolution ideal pixels."""
 
     layers: Float[Tensor, "b 3 h w"]
     """Unlikeness to a shaft; 1 inside the field of view, else 0; log brightness."""
-    factor: int
-    """Full-resolution pixels a small one."""
-    image_size: tuple[int, int]
-    """(height, width) at full resolution."""
-    lens: Lens
-    half_diagonal_px: float
-    """Reach of a line from the centre of the picture, ideal px."""
+    canvas: Canvas
+    width_px: int
+    """Width of the raw picture."""
 
     @property
-    def centre(self) -> tuple[float, float]:
-        """Middle of the picture, px."""
-        return (self.image_size[1] - 1) / 2, (self.image_size[0] - 1) / 2
+    def factor(self) -> int:
+        """Full-resolution pixels a small one."""
+        return self.canvas.factor
+
+    @property
+    def half_diagonal_px(self) -> float:
+        """Reach of a line from the middle, full-resolution px."""
+        return self.canvas.half_diagonal_px
 
     def read(
         self, ideal: Float[Tensor, "b *points 2"]
     ) -> tuple[Float[Tensor, " b *points"], Bool[Tensor, " b *points"], Float[Tensor, " b *points"]]:
         """Unlikeness at ideal points, whether they lie in the field of view, and log brightness."""
-        raw = self.lens.to_raw(ideal)
-        values = sample(self.layers, (raw + 0.5) / self.factor - 0.5)
-        return values[..., 0], (values[..., 1] > 0.75) & inside(raw, self.image_size), values[..., 2]
+        place = (ideal - ideal.new_tensor(self.canvas.origin)) / self.factor
+        values = sample(self.layers, place)
+        return values[..., 0], (values[..., 1] > 0.75) & inside(place, self.canvas.size, -0.5), values[..., 2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,10 +106,10 @@ def snap(picture: SmallPicture, lines: HoughLines) -> HoughLines:
         picture: the small picture.
         lines: `rho` in full-resolution px.
     """
-    stations, step = 96, float(picture.factor)
+    stations, step = 64, float(picture.factor)
     t = torch.linspace(-1, 1, stations, device=lines.rho.device) * picture.half_diagonal_px
     deltas = torch.arange(-4, 5, device=t.device, dtype=t.dtype) * step
-    centre = t.new_tensor(picture.centre)
+    centre = t.new_tensor(picture.canvas.centre)
     tangent = torch.stack([-lines.normal[..., 1], lines.normal[..., 0]], -1)
     across = lines.rho[..., None, None] + deltas  # (b, p, 1, 9)
     points = (
@@ -154,11 +155,11 @@ def pair(lines: HoughLines, picture: SmallPicture, settings: DetectorSettings, c
     offset = torch.stack([rho_a / cos_a, -rho_b / cos_b], -1)
     width = (offset[..., 0] - offset[..., 1]) * 1.0
     facing = (n_a * n_b).sum(-1) < -torch.cos(torch.deg2rad(width.new_tensor(settings.max_convergence_deg)))
-    size = float(picture.image_size[1])
+    size = float(picture.width_px)
     fits = (width > settings.min_width_fraction * size) & (width < settings.max_width_fraction * size)
     score = torch.minimum(lines.votes[:, first], lines.votes[:, second]) * (facing & fits)
     best = score.topk(min(count, score.shape[1]), dim=1)
-    centre = width.new_tensor(picture.centre)
+    centre = width.new_tensor(picture.canvas.centre)
     middle = offset.mean(-1, keepdim=True)
     strips = Strips(centre + middle * left, along, offset - middle, slope, score > 0)
     return strips.pick(best.indices)

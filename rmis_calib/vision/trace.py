@@ -4,7 +4,7 @@ The search for strips assumes straight lines; here each contour may wander by a 
 lens whose distortion nobody measured, or a bent shaft, does not lose the far end.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -70,6 +70,12 @@ class Trace:
     surround: Float[Tensor, "b k"]
     """How far the surroundings lie above the shaft's own tone."""
 
+    def listed(self, keep: Bool[Tensor, "b k"]) -> "Trace":
+        """The kept strips of all frames as one list, (1, m)."""
+        own = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("strips", "t")}
+        strips = Strips(**{name: value[keep][None] for name, value in vars(self.strips).items()})
+        return Trace(strips=strips, t=self.t, **{name: value[keep][None] for name, value in own.items()})
+
 
 @dataclass(frozen=True, eq=False)
 class _Sides:
@@ -116,7 +122,7 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
     inf = t.new_tensor(torch.inf)
     step = torch.where(sides.seen, sides.rise, inf).amin(2)
     outer = torch.where(sides.seen, sides.outer, inf).amin(2)
-    wide = left - right > settings.min_width_fraction * picture.image_size[1]
+    wide = left - right > settings.min_width_fraction * picture.width_px
     on = centre_seen & sides.seen.any(2) & wide & strips.valid[..., None]
     on &= tone[..., :7].median(-1).values - sides.brightness.mean(2) < MAX_BRIGHTER
     on &= (step > settings.min_contrast) & (inner < outer - 0.5 * settings.min_contrast)
