@@ -89,17 +89,16 @@ def plan_path(
     if settings.kind == "smooth":
         path = _smooth_path(centre, half_range, settings.speed, generator)
         return path, START_S + np.arange(frames) / settings.frame_rate_hz
-    if settings.kind == "grid":
-        stops = _grid_stops(settings, frames, generator)
-    else:
-        stops = _random_stops(settings, frames, generator, lambda unit: _split(centre + half_range * unit, in_view))
+
+    def good(unit: Array) -> Array:
+        readings = centre + half_range * unit
+        return in_view(readings[:, :3], readings[:, 3:])
+
+    make = _grid_stops if settings.kind == "grid" else _random_stops
+    stops = make(settings, frames, generator, good)
     times = START_S + (np.arange(frames) + 0.5) * settings.stop_period_s
     none = np.zeros((0, 6))
     return JointPath(centre, half_range, times, stops, none, none, none), times
-
-
-def _split(readings: Array, in_view: InView) -> Array:
-    return in_view(readings[:, :3], readings[:, 3:])
 
 
 def _smooth_path(centre: Array, half_range: Array, speed: float, generator: np.random.Generator) -> JointPath:
@@ -112,14 +111,21 @@ def _smooth_path(centre: Array, half_range: Array, speed: float, generator: np.r
     return JointPath(centre, half_range, np.zeros(0), none, frequency, phase, amplitude)
 
 
-def _grid_stops(settings: MotionSettings, frames: int, generator: np.random.Generator) -> Array:
+def _grid_stops(
+    settings: MotionSettings, frames: int, generator: np.random.Generator, good: Callable[[Array], Array]
+) -> Array:
     laparoscope = joint_grid(settings.positions_laparoscope if settings.laparoscope == "moving" else 1)
     instrument = joint_grid(settings.positions_instrument)
     places = len(laparoscope) * len(instrument)
     if frames > places:
         raise ValueError(f"motions: expected at most {places} on this grid, found {frames}")
-    chosen = np.sort(generator.permutation(places)[:frames])
-    return np.concatenate([laparoscope[chosen // len(instrument)], instrument[chosen % len(instrument)]], axis=-1)
+    unit = np.concatenate(
+        [np.repeat(laparoscope, len(instrument), 0), np.tile(instrument, (len(laparoscope), 1))], axis=-1
+    )
+    order = generator.permutation(places)
+    if settings.keep_end_in_view:
+        order = order[np.argsort(~good(unit)[order], kind="stable")]
+    return unit[np.sort(order[:frames])]
 
 
 def _random_stops(

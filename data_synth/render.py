@@ -16,7 +16,8 @@ from data_synth.foreground import LoopPoses, draw_loop
 from data_synth.instruments import edge
 from data_synth.kinematics import Array, rigid_inverse, transform_points
 from data_synth.materials import other_finish, own_finish
-from data_synth.props import HEAD_BEYOND_MM, RADIUS_MM, WRIST_MM, OtherInstrument
+from data_synth.props import OtherInstrument
+from data_synth.scene import ShaftInCamera
 from data_synth.sensor import Sensor
 from data_synth.settings import SynthConfig
 from data_synth.textures import filtered_noise
@@ -26,6 +27,7 @@ from data_synth.world import World, build_world
 
 CAMERA_RIGHT_P_LIGHT = np.array([2.5, -4.5, -1.0])
 """End of the light guide, between and above the two lenses, mm."""
+OTHER_WRIST_RATIO = 0.9
 SMOKE_COLOUR = (0.74, 0.73, 0.76)
 SMOKE_SPEED = np.array([0.11, -0.07])
 """Drift of the smoke, pictures a second."""
@@ -94,7 +96,8 @@ class Renderer:
         light = self._tensor(transform_points(world.camera_T_camera_right(side), CAMERA_RIGHT_P_LIGHT), torch.float64)
         brush = Brush(view.rays, light, self.settings.blur_px, self.settings.gamma)
         instruments = [
-            (self._other(other, base_T_camera, times), other_finish(other.kind)) for other in world.props.others
+            (self._other_poses(side, other, base_T_camera, times), other_finish(other.kind))
+            for other in world.props.others
         ]
         instruments.append((self.own_poses(side, frames, times), own_finish(self.look)))
         picture = self._background(view, base_T_camera, light, [poses for poses, _ in instruments])
@@ -127,41 +130,20 @@ class Renderer:
     def own_poses(self, side: str, frames: Array, times: Array) -> InstrumentPoses:
         """The logged instrument in a camera; `frames` and `times` are (B, R)."""
         shaft, camera_T_rcm = self.world.shaft(side, frames, times)
-        v = shaft.camera_v_axis
-        s_head = np.einsum("...i,...i->...", shaft.camera_p_head - shaft.camera_p_rcm, v)
-        return self._poses(
-            shaft.camera_p_rcm,
-            v,
-            camera_T_rcm[..., :3, 0],
-            shaft.s_end_mm,
-            s_head,
-            shaft.radius_mm,
-            self.look.wrist_radius_ratio,
-        )
+        return self._poses(shaft, camera_T_rcm[..., :3, 0], self.look.wrist_radius_ratio)
 
-    def _other(self, other: OtherInstrument, base_T_camera: Array, times: Array) -> InstrumentPoses:
-        """An instrument that is not logged."""
-        camera_T_base = rigid_inverse(base_T_camera)
-        p = transform_points(camera_T_base, other.base_p_rcm)
-        along = transform_points(camera_T_base, other.head(times)) - p
-        s_head = np.linalg.norm(along, axis=-1)
-        return self._poses(
-            p,
-            along / s_head[..., None],
-            camera_T_base[..., :3, 0],
-            s_head - WRIST_MM,
-            s_head + HEAD_BEYOND_MM,
-            RADIUS_MM,
-            0.9,
-        )
+    def _other_poses(self, side: str, other: OtherInstrument, base_T_camera: Array, times: Array) -> InstrumentPoses:
+        """An instrument that is not logged; its jaws stay in one plane of base."""
+        near_side = np.swapaxes(base_T_camera[..., :3, :3], -1, -2)[..., 0]
+        return self._poses(self.world.other_shaft(side, other, times), near_side, OTHER_WRIST_RATIO)
 
-    def _poses(
-        self, p: Array, v: Array, near_side: Array, s_end: Array, s_head: Array, radius: float, ratio: float
-    ) -> InstrumentPoses:
+    def _poses(self, shaft: ShaftInCamera, near_side: Array, wrist_ratio: float) -> InstrumentPoses:
+        p, v = shaft.camera_p_rcm, shaft.camera_v_axis
+        s_head = np.einsum("...i,...i->...", shaft.camera_p_head - p, v)
         sideways = np.cross(v, near_side)
         sideways /= np.linalg.norm(sideways, axis=-1, keepdims=True)
-        tensors = [self._tensor(a, torch.float64) for a in (p, v, sideways, s_end, s_head)]
-        return InstrumentPoses(*tensors, radius=radius, wrist_ratio=ratio)
+        tensors = [self._tensor(a, torch.float64) for a in (p, v, sideways, shaft.s_end_mm, s_head)]
+        return InstrumentPoses(*tensors, radius=shaft.radius_mm, wrist_ratio=wrist_ratio)
 
     def _blow_smoke(self, picture: Tensor, view: _View, times: Array) -> None:
         """Mix drifting smoke over the pictures, in place."""

@@ -119,7 +119,8 @@ class MotionSettings:
     joint_rate_hz: Positive = 50.0
     """Rate of joints.csv."""
     keep_end_in_view: bool = True
-    """Draw `random` stops again until the shaft's end and the head point are in both pictures."""
+    """Draw `random` stops again until the shaft's end and the head point are in both pictures; of a `grid`, prefer the
+    places where they are."""
 
 
 @dataclass(frozen=True, config=_STRICT)

@@ -3,12 +3,13 @@ NumPy."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from data_synth.contours import front_point, to_image, view_cylinder, visible_interval
-from data_synth.kinematics import Array, rigid_inverse
+from data_synth.kinematics import Array, rigid, rigid_inverse
+from data_synth.scene import ShaftInCamera
 from data_synth.world import World
 
 POLYLINE_POINTS = 64
@@ -44,6 +45,7 @@ class SideTruth:
         head_uv: (N, 2) the same in raw pixels.
         visible: (N,) whether enough of the shaft is in the picture.
         end_visible: (N,) whether the shaft's end is.
+        others: the same of every instrument that is not logged; their RCM frame is parallel to the camera.
     """
 
     camera_T_rcm: Array
@@ -65,17 +67,31 @@ class SideTruth:
     visible: Array
     end_visible: Array
 
+    others: tuple[SideTruth, ...] = ()
+
     def arrays(self) -> dict[str, Array]:
-        """All arrays by name."""
-        return {f.name: getattr(self, f.name) for f in fields(self)}
+        """All arrays by name, those of other instruments as other0_..., other1_..."""
+        own = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "others"}
+        more = {f"other{i}_{name}": a for i, other in enumerate(self.others) for name, a in other.arrays().items()}
+        return own | more
 
 
 def side_truth(world: World, side: str) -> SideTruth:
     """Truth of one camera over all frames."""
+    times = world.frame_times_s
+    shaft, camera_T_rcm = world.shaft(side, np.arange(len(times)), times)
+    others = []
+    for other in world.props.others:
+        other_shaft = world.other_shaft(side, other, times)
+        camera_T_port = rigid(np.eye(3), other_shaft.camera_p_rcm)
+        others.append(_shaft_truth(world, side, other_shaft, camera_T_port))
+    return replace(_shaft_truth(world, side, shaft, camera_T_rcm), others=tuple(others))
+
+
+def _shaft_truth(world: World, side: str, shaft: ShaftInCamera, camera_T_rcm: Array) -> SideTruth:
+    """Truth of one shaft in one camera."""
     camera = world.cameras[side]
-    frames, times = np.arange(len(world.frame_times_s)), world.frame_times_s
-    shaft, camera_T_rcm = world.shaft(side, frames, times)
-    camera_T_base = rigid_inverse(world.base_T_camera(side, times))
+    camera_T_base = rigid_inverse(world.base_T_camera(side, world.frame_times_s))
     p, v, radius = shaft.camera_p_rcm, shaft.camera_v_axis, shaft.radius_mm
     view = view_cylinder(p, v, radius)
     low, high = visible_interval(p, v, 0.0, shaft.s_end_mm, camera.extent())

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_synth.cameras import Camera, build_camera
-from data_synth.kinematics import Array, pose_noise, rigid_inverse
+from data_synth.kinematics import Array, pose_noise, rigid_inverse, transform_points
 from data_synth.motion import JointPath, plan_path
-from data_synth.props import Props, hidden_by, place_props
+from data_synth.props import HEAD_BEYOND_MM, RADIUS_MM, WRIST_MM, OtherInstrument, Props, hidden_by, place_props
 from data_synth.scene import Scene, ShaftInCamera, build_scene, poses_at, shaft_in_camera
 from data_synth.settings import SynthConfig
 
@@ -68,6 +68,15 @@ class World:
         withdrawn = np.where(self.present[frames], 0.0, ABSENT_MM)
         head = shaft.camera_p_head - withdrawn[..., None] * shaft.camera_v_axis
         return replace(shaft, s_end_mm=shaft.s_end_mm - withdrawn, camera_p_head=head), camera_T_rcm
+
+    def other_shaft(self, side: str, other: OtherInstrument, times_s: Array) -> ShaftInCamera:
+        """An instrument that is not logged, in a camera at times (...)."""
+        camera_T_base = rigid_inverse(self.base_T_camera(side, times_s))
+        p = transform_points(camera_T_base, other.base_p_rcm)
+        camera_p_head = transform_points(camera_T_base, other.head(times_s))
+        length = np.linalg.norm(camera_p_head - p, axis=-1)
+        v = (camera_p_head - p) / length[..., None]
+        return ShaftInCamera(p, v, length - WRIST_MM, camera_p_head + HEAD_BEYOND_MM * v, RADIUS_MM)
 
     def in_sight(self, side: str, camera_T_base: Array, camera_p: Array) -> NDArray[np.bool_]:
         """Whether points (..., 3) of the instrument are seen: inside the picture and its bright field, not behind

@@ -169,14 +169,18 @@ def _write_pictures(folder: Path, world: World, device: str, on_progress: Progre
     rate = _frame_rate(world)
     writers = {side: make(folder / side, world.config.output, renderer.size, rate) for side in world.cameras}
 
-    def step(side: str, frame: int) -> None:
-        writers[side].add(renderer.render(side, np.array([frame]))[0].cpu().numpy())
+    batch = 8 if renderer.device.type == "cuda" else 1
+
+    def step(side: str, frames: Array) -> None:
+        for picture in renderer.render(side, frames).cpu().numpy():
+            writers[side].add(picture)
 
     with ThreadPoolExecutor(len(writers)) as pool:
         try:
-            for frame in range(total):
-                list(pool.map(step, writers, [frame] * len(writers)))
-                on_progress(frame + 1, total)
+            for first in range(0, total, batch):
+                frames = np.arange(first, min(first + batch, total))
+                list(pool.map(step, writers, [frames] * len(writers)))
+                on_progress(int(frames[-1]) + 1, total)
         finally:
             for writer in writers.values():
                 writer.close()

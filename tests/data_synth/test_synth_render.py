@@ -14,6 +14,7 @@ from data_synth.sensor import Sensor
 from data_synth.settings_picture import CameraSettings
 from data_synth.textures import filtered_noise, upper_share
 from data_synth.tissue import intersect
+from data_synth.truth import side_truth
 from data_synth.world import build_world
 
 SMALL: dict[str, Any] = {
@@ -171,3 +172,21 @@ def test_textures_have_unit_variance_and_the_share_asked_for() -> None:
     assert field.std() == pytest.approx(1.0)
     assert upper_share(field, 0.25, 0.05).mean() == pytest.approx(0.25, abs=0.02)
     assert upper_share(field, 0.0, 0.05).max() == 0.0
+
+
+@pytest.mark.parametrize("kind", ["grid", "random"])
+def test_stops_keep_the_end_in_view(kind: str) -> None:
+    world = build_world(small(motions=80, motion={"kind": kind}))
+    assert all(side_truth(world, side).end_visible.all() for side in world.cameras)
+
+
+def test_grid_that_is_too_small_is_refused() -> None:
+    with pytest.raises(ValueError, match="motions: expected at most 8 on this grid, found 9"):
+        build_world(small(motions=9, motion={"kind": "grid", "laparoscope": "static", "positions_instrument": 2}))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
+def test_cuda_draws_the_same_pictures() -> None:
+    config = small(look={"smoke": 0.4, "other_instruments": ["dark"], "tissue_over_shaft": True}, noise_levels=0.0)
+    (cpu, _), (cuda, _) = (render_frames(config, 3, device=d) for d in ("cpu", "cuda"))
+    assert (cpu.float() - cuda.cpu().float()).abs().quantile(0.999) <= 3.0

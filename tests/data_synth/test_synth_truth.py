@@ -174,3 +174,20 @@ def test_hidden_points_are_where_the_foreground_is_drawn() -> None:
     assert 20 < sum(hidden) < len(hidden) - 20
     # Points within a blur of the border may go either way.
     assert np.mean(np.array(hidden) == np.array(drawn)) > 0.97
+
+
+def test_other_instruments_have_their_truth_too() -> None:
+    config = dataclasses.replace(load_synth_config("two_instruments"), motions=3)
+    world = build_world(config)
+    truth = side_truth(world, "right")
+    assert len(truth.others) == 2
+    assert "other1_contour_uv" in truth.arrays()
+    alone = Renderer(dataclasses.replace(world, props=dataclasses.replace(world.props, others=())))
+    picture, without = (r.encoded("right", np.arange(3)).numpy() for r in (Renderer(world), alone))
+    changed = np.abs(picture - without).max(-1) > 0.1
+    for other in truth.others:
+        inside = other.contour_visible.all(1)  # (N, P): both edges are in the picture
+        frame, point = np.nonzero(inside)
+        assert len(frame) > 20
+        uv = np.round(other.contour_uv[frame, :, point].mean(1)).astype(int)
+        assert changed[frame, uv[:, 1], uv[:, 0]].mean() > 0.9
