@@ -117,7 +117,8 @@ def _finish(
         information = floored_information(normal.H - prior, expected.H) + prior
     weight_all = torch.ones_like(packed.line_ok[0], dtype=packed.p.dtype) if weight is None else weight
     scale = information.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
-    inverse = torch.linalg.pinv(information * scale[:, :, None] * scale[:, None], hermitian=True, rtol=1e-15)
+    scaled = torch.nan_to_num(information * scale[:, :, None] * scale[:, None], posinf=0.0, neginf=0.0)
+    inverse = torch.linalg.pinv(scaled, hermitian=True, rtol=1e-15)
     covariance = inverse * scale[:, :, None] * scale[:, None]
     if bool((problem.noise.edge_bias > 0).any()):
         covariance = covariance + systematic_covariance(

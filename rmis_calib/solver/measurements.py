@@ -16,6 +16,8 @@ from rmis_calib.solver.settings import NoiseSettings
 from rmis_calib.solver.soa import batch_last, rotate
 
 LINE, END, HEAD = 0, 1, 2
+MIN_SIGMA = 1e-6
+"""Least image noise, normalised units (a thousandth of a pixel): exact data are not a division by zero."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +145,7 @@ class Packed:
 
 def pack(problem: Problem, noise: NoiseSettings) -> Packed:
     """The packed form of a problem with exactly one trial axis."""
-    image = torch.nan_to_num(problem.noise.image, nan=noise.image)[:, None, None]
+    image = torch.nan_to_num(problem.noise.image, nan=noise.image).clamp_min(MIN_SIGMA)[:, None, None]
     arm_R_rcm = batch_last(problem.arm_T_rcm[..., :3, :3], 2)
     head_rcm = torch.nan_to_num(batch_last(problem.rcm_p_head, 1))
     line = _lines(problem, image)

@@ -69,9 +69,9 @@ class VerdictSettings:
 
     working_point_mm: tuple[float, float, float] | None = None
     """Point in the right camera's frame at which the error counts; default: the mean measured shaft end or head point."""
-    trustworthy_mm: Positive = 4.0
+    trustworthy_mm: Positive = 2.5
     """Predicted error at the working point below which the result is `trustworthy`."""
-    unobservable_mm: Positive = 12.0
+    unobservable_mm: Positive = 10.0
     """Predicted error above which the transform is `unobservable`; between the two it is `weak`."""
     trustworthy_deg: Positive = 2.0
     """Predicted rotation error below which the result is `trustworthy`."""

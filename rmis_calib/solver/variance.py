@@ -111,10 +111,10 @@ def _score(
     k, b, n = rows.r.shape
     S = torch.empty((k, k, b, n), dtype=r.dtype, device=r.device)
     covariance(rows.w, rows.a, image_variance(packed, noise), packed.row_camera, noise, S)
-    inverse = torch.linalg.inv(S.permute(2, 3, 0, 1))
+    inverse = _inverse(S.permute(2, 3, 0, 1))
     a, B = inverse @ r, inverse @ J
     H = (J.mT @ B).sum(1) + torch.diag_embed(layout.sigma.square().reciprocal())
-    H_inverse = torch.linalg.inv(H)
+    H_inverse = _inverse(H)
     diagonals, kinematic = parts
     products, scores = [], []
     for Q in (*diagonals, *kinematic):
@@ -127,3 +127,16 @@ def _score(
     flat = torch.stack([p.flatten(1) for p in products], dim=1)
     flat_t = torch.stack([p.mT.flatten(1) for p in products], dim=1)
     return torch.stack(scores, dim=-1), 0.5 * flat @ flat_t.mT
+
+
+def _inverse(matrix: Float[Tensor, "*batch m m"]) -> Float[Tensor, "*batch m m"]:
+    """Inverse of positive definite matrices, scaled to a unit diagonal; zero for one that is singular to rounding.
+
+    Such a motion, or such an unknown, then takes no part in the score. It happens where an estimate runs away along a
+    direction that the data do not see.
+    """
+    scale = matrix.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
+    unit = matrix * scale[..., :, None] * scale[..., None, :]
+    inverse, failed = torch.linalg.inv_ex(unit)
+    usable = (failed == 0) & torch.isfinite(inverse).flatten(-2).all(-1)
+    return torch.where(usable[..., None, None], inverse * scale[..., :, None] * scale[..., None, :], 0.0)
