@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from data_synth.instruments import Cylinders, Pixels, dot3, edge, hit_capsule, hit_cylinder, make_cylinders, unit3
+from data_synth.instruments import Hit, Pixels, dot3, edge, hit_capsule, hit_cylinder, make_cylinders, unit3
 from data_synth.materials import Finish, Surface, light_cylinder
 
 MARGIN_PX = 4.0
@@ -18,6 +18,8 @@ JAW_OPENING_RAD = 0.30
 """Half the angle between the jaws."""
 CLEVIS_RATIO = 0.74
 """Radius of the clevis over that of the shaft."""
+COVERED_MM = 3.0
+"""So far before its end the shaft certainly covers what is in it, blur and all."""
 PENUMBRA_MM = 1.6
 """Half-width of a shadow's soft border."""
 
@@ -109,18 +111,24 @@ def draw_instrument(picture: Tensor, brush: Brush, poses: InstrumentPoses, finis
     values = picture.view(-1, 3)
     p, v = poses.p_axis.flatten(0, 1), poses.v_axis.flatten(0, 1)
     s_end, s_head = poses.s_end.flatten(), poses.s_head.flatten()
-    colour = _jaws(values[flat], brush, pixels, p + s_head[:, None] * v, v, poses.side.flatten(0, 1))
     cylinders = make_cylinders(p, v, brush.camera_p_light.expand_as(p))
+    shaft = _Part(poses.radius, finish.shaft, torch.full_like(s_end, -1e4).float(), s_end.float())
+    hit = hit_cylinder(pixels, cylinders, shaft.radius, brush.blur_px)
+    # Wrist and jaws can only show where the shaft has ended or nearly so: a quarter of the pixels.
+    tip = (hit.s > (shaft.s_to - COVERED_MM)[pixels.pose]).nonzero()[:, 0]
+    near = Pixels(pixels.xy[tip], pixels.jacobian[tip], pixels.pose[tip])
+    colour = values[flat]
+    beyond = _jaws(colour[tip], brush, near, p + s_head[:, None] * v, v, poses.side.flatten(0, 1))
     s_sleeve = s_end + 0.55 * (s_head - s_end)
-    far = torch.full_like(s_end, -1e4)
     for ratio, surface, s_from, s_to in (
         (CLEVIS_RATIO, finish.clevis, s_sleeve - 1.0, s_head + 1.0),
         (poses.wrist_ratio, finish.sleeve, s_end - 1.0, s_sleeve),
-        (1.0, finish.shaft, far, s_end),
     ):
         part = _Part(ratio * poses.radius, surface, s_from.float(), s_to.float())
-        colour = _cylinder(colour, brush, pixels, cylinders, part)
-    values[flat] = colour
+        part_hit = hit_cylinder(near, cylinders, part.radius, brush.blur_px)
+        beyond = _paint(beyond, brush, near, part_hit, cylinders.light, part)
+    colour[tip] = beyond
+    values[flat] = _paint(colour, brush, pixels, hit, cylinders.light, shaft)
 
 
 @dataclass(frozen=True)
@@ -133,13 +141,12 @@ class _Part:
     s_to: Tensor
 
 
-def _cylinder(colour: Tensor, brush: Brush, pixels: Pixels, cylinders: Cylinders, part: _Part) -> Tensor:
-    """Paint a part over colours (M, 3)."""
-    hit = hit_cylinder(pixels, cylinders, part.radius, brush.blur_px)
+def _paint(colour: Tensor, brush: Brush, pixels: Pixels, hit: Hit, light: Tensor, part: _Part) -> Tensor:
+    """Paint a part where rays hit it over colours (M, 3); light (K, 3) in the cylinders' frames."""
     before = edge((part.s_to[pixels.pose] - hit.s) / hit.s_per_px, brush.blur_px)
     after = edge((hit.s - part.s_from[pixels.pose]) / hit.s_per_px, brush.blur_px)
     cover = (hit.inside * before * after)[:, None]
-    return torch.lerp(colour, light_cylinder(hit, cylinders.light[pixels.pose], part.surface, brush.gamma), cover)
+    return torch.lerp(colour, light_cylinder(hit, light[pixels.pose], part.surface, brush.gamma), cover)
 
 
 def _jaws(colour: Tensor, brush: Brush, pixels: Pixels, head: Tensor, v_axis: Tensor, side: Tensor) -> Tensor:
