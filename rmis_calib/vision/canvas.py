@@ -1,7 +1,7 @@
 """The small picture on which shafts are searched for: area-averaged, and laid out in ideal pixels.
 
-Straight contours are straight on it whatever the lens does, so nothing after it knows about distortion until the contours
-are measured at full resolution.
+Straight contours are straight on it whatever the lens does, so nothing after it knows about distortion until the
+contours are measured at full resolution.
 """
 
 import math
@@ -26,7 +26,7 @@ class Canvas:
     size: tuple[int, int]
     """(height, width), small px."""
     grid: Float[Tensor, "1 h w 2"] | None
-    """For each small pixel its place on the shrunken raw picture, in grid_sample's coordinates; None without distortion."""
+    """Place of each small pixel on the shrunken raw picture, in grid_sample's coordinates; None without distortion."""
     covered: Bool[Tensor, "h w"] | None
     """Small pixels whose raw place is in the picture; None: all."""
 

@@ -17,6 +17,9 @@ _ANGLES = 180
 _RHO_STEP_PX = 1.5
 _ANGLE_SPREAD = 2
 """Each pixel votes for 2 * 2 + 1 angles of 2 degrees: gradients on a small picture are good to about 3 degrees."""
+_GATE_PX = 1.8
+_AGREEMENT = 0.98
+"""Cosine of the angle, 11 degrees, within which an edge pixel points a line's way."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +120,31 @@ def peaks(votes: Float[Tensor, "b angles rhos"], count: int) -> HoughLines:
     theta = (angle + _vertex(at(-1, 0), at(0, 0), at(1, 0))) * (2 * math.pi / angles)
     distance = (rho + _vertex(at(0, -1), at(0, 0), at(0, 1)) - rhos // 2) * _RHO_STEP_PX
     return HoughLines(torch.stack([theta.cos(), theta.sin()], -1), distance, best.values)
+
+
+def refine(edges: EdgePixels, lines: HoughLines) -> HoughLines:
+    """Lines moved onto the edge pixels that lie on them and point their way, by least squares within `_GATE_PX`.
+
+    Other edges that a line crosses point elsewhere and do not pull at it.
+    """
+    frames, count = lines.rho.shape
+    cosine, sine, rho = (value[edges.frame] for value in (lines.normal[..., 0], lines.normal[..., 1], lines.rho))
+    u, v = edges.uv[:, :1], edges.uv[:, 1:]
+    across = u * cosine + v * sine - rho  # (m, p)
+    on_line = across.abs() < _GATE_PX
+    on_line &= edges.normal[:, :1] * cosine + edges.normal[:, 1:] * sine > _AGREEMENT
+    edge, line = on_line.nonzero(as_tuple=True)  # few: an edge lies on one or two lines
+    t = edges.uv[edge, 1] * cosine[edge, line] - edges.uv[edge, 0] * sine[edge, line]
+    y, weight = across[edge, line], edges.weight[edge]
+    moments = torch.stack([weight, weight * t, weight * y, weight * t * t, weight * t * y], -1)
+    total = moments.new_zeros(frames * count, 5).index_add_(0, edges.frame[edge] * count + line, moments)
+    n, t, y, tt, ty = total.reshape(frames, count, 5).unbind(-1)
+    n = n.clamp(min=1e-6)
+    slope = ((ty - t * y / n) / (tt - t * t / n).clamp(min=1.0)).clamp(-0.06, 0.06)
+    offset = y / n - slope * t / n
+    turned = lines.normal - slope[..., None] * torch.stack([-lines.normal[..., 1], lines.normal[..., 0]], -1)
+    length = torch.sqrt(turned[..., 0].square() + turned[..., 1].square())
+    return HoughLines(turned / length[..., None], (lines.rho + offset) / length, lines.votes)
 
 
 def _window_max(values: Float[Tensor, "b h w"], reach: int, dim: int) -> Float[Tensor, "b h2 w2"]:

@@ -10,11 +10,11 @@ from rmis_calib.vision import hough, scoring, shaft_mask, strips, trace
 from rmis_calib.vision.canvas import Canvas, shrink
 from rmis_calib.vision.settings import DetectorSettings
 
-_LINES, _PAIRS = 40, 32
+_LINES, _PAIRS, _STRIPS = 48, 160, 24
 # Blurred ridges of the field's border reach this far into it, small px.
 _RIM_PX = 4
-# A ridge below this is texture: 3 per cent of brightness a small pixel.
-_MIN_GRADIENT = 0.03
+# A ridge below this is texture: 4 per cent of brightness a small pixel.
+_MIN_GRADIENT = 0.04
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +52,11 @@ def search(
     unlike, tone = shaft_mask.unlikeness(rgb, seen)
     ridge, edges = _edges(unlike, well_inside)
     votes = hough.vote(edges, images.shape[0], canvas.half_diagonal_px / canvas.factor + 2)
-    lines = hough.peaks(votes, _LINES)
+    lines = hough.refine(edges, hough.peaks(votes, _LINES))
     picture = strips.SmallPicture(torch.stack([unlike, seen.to(unlike.dtype), tone], 1), canvas, images.shape[-1])
-    lines = strips.snap(picture, hough.HoughLines(lines.normal, lines.rho * canvas.factor, lines.votes))
-    evidence = scoring.inspect(picture, strips.pair(lines, picture, settings, _PAIRS), settings)
+    lines = hough.HoughLines(lines.normal, lines.rho * canvas.factor, lines.votes)
+    pairs = scoring.screen(picture, strips.pair(lines, picture, settings, _PAIRS), settings, _STRIPS)
+    evidence = scoring.inspect(picture, pairs, settings)
     scores = scoring.score(evidence, settings)
     index, best = scoring.distinct(evidence, scores, count)
     traced = trace.trace(picture, evidence.strips.pick(index), settings)

@@ -77,9 +77,9 @@ def field_of_view(
     right = -_convex(torch.where(empty, torch.inf, -last))
     field = []
     for rim in (0, margin):
-        # The border of the picture itself is no edge of the field: nothing is cut there.
-        low, high = left + rim * (left > 0), right - rim * (right < width - 1)
-        first_row, last_row = top + rim * (top > 0), bottom - rim * (bottom < height - 1)
+        # Half of the rim along the border of the picture itself: its last rows may be half black.
+        low, high = left + rim * (0.5 + 0.5 * (left > 0)), right - rim * (0.5 + 0.5 * (right < width - 1))
+        first_row, last_row = top + rim * (0.5 + 0.5 * (top > 0)), bottom - rim * (0.5 + 0.5 * (bottom < height - 1))
         across = (columns >= low[..., None]) & (columns <= high[..., None])
         down = (rows >= first_row[:, None]) & (rows <= last_row[:, None])
         field.append(across & down[..., None])

@@ -99,46 +99,6 @@ class Strips:
         )
 
 
-def snap(picture: SmallPicture, lines: HoughLines) -> HoughLines:
-    """Lines moved onto the ridge of the gradient that they follow, by weighted least squares in a shrinking gate.
-
-    Args:
-        picture: the small picture.
-        lines: `rho` in full-resolution px.
-    """
-    stations, step = 64, float(picture.factor)
-    t = torch.linspace(-1, 1, stations, device=lines.rho.device) * picture.half_diagonal_px
-    deltas = torch.arange(-4, 5, device=t.device, dtype=t.dtype) * step
-    centre = t.new_tensor(picture.canvas.centre)
-    tangent = torch.stack([-lines.normal[..., 1], lines.normal[..., 0]], -1)
-    across = lines.rho[..., None, None] + deltas  # (b, p, 1, 9)
-    points = (
-        centre + across[..., None] * lines.normal[:, :, None, None] + (t[:, None, None] * tangent[:, :, None, None])
-    )
-    value, seen, _ = picture.read(points)
-    rise = ((value[..., 2:] - value[..., :-2]) * (seen[..., 2:] & seen[..., :-2])).clamp(0.0, 0.5)
-    place = deltas[1:-1].expand_as(rise)
-    offset, slope = torch.zeros_like(lines.rho), torch.zeros_like(lines.rho)
-    for gate in (2.0 * step, 1.4 * step, 1.0 * step):
-        miss = place - offset[..., None, None] - slope[..., None, None] * t[:, None]
-        weight = rise * torch.exp(-0.5 * (miss / gate) ** 2)
-        offset, slope = _weighted_line(t, place, weight)
-    normal = lines.normal - slope[..., None] * tangent
-    length = normal.norm(dim=-1, keepdim=True)
-    return HoughLines(normal / length, (lines.rho + offset) / length[..., 0], lines.votes)
-
-
-def _weighted_line(t: Tensor, place: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Offset at t = 0 and slope of the weighted line through (t, place); slope within 3 degrees."""
-    total = weight.sum((-1, -2)).clamp(min=1e-6)
-    mean_t = (weight * t[:, None]).sum((-1, -2)) / total
-    mean_y = (weight * place).sum((-1, -2)) / total
-    dt = t[:, None] - mean_t[..., None, None]
-    slope = (weight * dt * place).sum((-1, -2)) / (weight * dt * dt).sum((-1, -2)).clamp(min=1e-6)
-    slope = slope.clamp(-0.05, 0.05)
-    return mean_y - slope * mean_t, slope
-
-
 def pair(lines: HoughLines, picture: SmallPicture, settings: DetectorSettings, count: int) -> Strips:
     """The `count` most voted pairs of lines that could be the contours of one cylinder.
 
