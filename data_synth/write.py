@@ -165,7 +165,7 @@ def _write_head_points(path: Path, world: World, truths: dict[str, SideTruth], g
 
 def _write_pictures(folder: Path, world: World, device: str, on_progress: Progress) -> None:
     renderer, total = Renderer(world, device), len(world.frame_times_s)
-    make = _VideoWriter if world.config.output.pictures == "video" else _ImageWriter
+    make = VideoWriter if world.config.output.pictures == "video" else ImageWriter
     rate = _frame_rate(world)
     writers = {side: make(folder / side, world.config.output, renderer.size, rate) for side in world.cameras}
 
@@ -192,7 +192,7 @@ def _frame_rate(world: World) -> Fraction:
     return Fraction(rate).limit_denominator(1001)
 
 
-class _VideoWriter:
+class VideoWriter:
     """H.264 with full chroma resolution, so that coloured edges stay where they are."""
 
     def __init__(self, path: Path, settings: OutputSettings, size: tuple[int, int], rate: Fraction) -> None:
@@ -212,7 +212,7 @@ class _VideoWriter:
         self._container.close()
 
 
-class _ImageWriter:
+class ImageWriter:
     """PNG files, numbered."""
 
     def __init__(self, path: Path, settings: OutputSettings, size: tuple[int, int], rate: Fraction) -> None:
