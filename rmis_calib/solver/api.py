@@ -9,7 +9,7 @@ from torch import Tensor
 
 from rmis_calib.errors import InsufficientDataError, ObservationsError
 from rmis_calib.geometry.rigid import rigid_from_rotation_translation
-from rmis_calib.solver.initialise import find_candidates
+from rmis_calib.solver.initialise import COLLAPSED_MM, collapsed, find_candidates
 from rmis_calib.solver.joint import JointFit, solve_joint
 from rmis_calib.solver.measurements import END, HEAD, LINE, Packed, pack
 from rmis_calib.solver.normal import NoiseModel
@@ -21,7 +21,7 @@ from rmis_calib.solver.residuals import State, residual_rows
 from rmis_calib.solver.settings import SolverSettings
 from rmis_calib.solver.solution import MotionReason, Nuisance, Solution, SolveStatus
 from rmis_calib.solver.statistics import LineStatistics
-from rmis_calib.solver.unknowns import UNITS, Nominal, initial_state
+from rmis_calib.solver.unknowns import TRANSLATION_SIGMA_MM, UNITS, Nominal, initial_state
 from rmis_calib.solver.variance import assumed_noise
 
 MIN_CHEIRALITY = 0.5
@@ -77,6 +77,7 @@ def _two_step_solution(flat: Problem, R: Tensor, t: Tensor, covariance: Tensor, 
     from rmis_calib.solver.joint import cheirality
 
     axis_only = flat.only("axis")
+    covariance = covariance + _unseen_depth(flat, R, t)
     packed = pack(axis_only, settings.noise)
     noise, _ = assumed_noise(flat, settings.noise)
     state = initial_state(Nominal.of(axis_only), R, t)
@@ -106,6 +107,17 @@ def _two_step_solution(flat: Problem, R: Tensor, t: Tensor, covariance: Tensor, 
         sight=sight,
         **_residuals(packed, state),
     )
+
+
+def _unseen_depth(flat: Problem, R: Tensor, t: Tensor) -> Float[Tensor, "b 6 6"]:
+    """Variance along the ray of the RCM where the lines of one camera do not tell its distance; zero elsewhere."""
+    p = flat.arm_T_rcm[..., :3, 3] @ R.mT + t[:, None]
+    centred = p - p.mean(-2, keepdim=True)
+    nearly_static = centred.norm(dim=-1).mean(-1) < COLLAPSED_MM
+    unseen = collapsed(p) | (nearly_static if flat.n_cameras == 1 else torch.zeros_like(nearly_static))
+    ray = torch.nn.functional.normalize(p.mean(-2), dim=-1)
+    block = TRANSLATION_SIGMA_MM**2 * ray[:, :, None] * ray[:, None]
+    return torch.nn.functional.pad(torch.where(unseen[:, None, None], block, 0.0), (3, 0, 3, 0))
 
 
 def _joint_solution(fit: JointFit, settings: SolverSettings) -> Solution:

@@ -9,7 +9,7 @@ the axis planes alone are degenerate: a laparoscope that stands still, small mot
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rmis_calib.geometry.rotations import project_to_so3
@@ -20,6 +20,10 @@ from rmis_calib.solver.statistics import LineStatistics
 
 CHEIRALITY_SLACK = 0.9
 """Minima whose cheirality is at least this part of the best one's compete by cost."""
+COLLAPSED_MM = 5.0
+"""An RCM nearer to the optical centre than this is no solution: see `collapsed`."""
+LIFTED_MM = 100.0
+"""Distance of the RCM from the camera that a start takes where the lines do not tell it."""
 DIRECTION_LENGTH_MM = 30.0
 """Weight of a direction against a point in the mixed start: a direction counts like points this far apart."""
 
@@ -86,9 +90,33 @@ def find_candidates(statistics: LineStatistics, grid: int, minima: int) -> Candi
     count = statistics.count.sum(-1, keepdim=True).clamp_min(1.0)
     R, rotation = search_rotations(statistics.rotation_gram.sum(1), grid, minima)
     t, points = solve_translation(statistics, R)
+    t = lift(statistics, R, t)
     reach = _mean_distance(statistics, R, t)
     score = rotation / count + points / (count * reach.clamp_min(1.0).square())
     return Candidates(R, t, torch.where(torch.isfinite(rotation), score, torch.inf), cheirality(statistics, R, t))
+
+
+def collapsed(p: Float[Tensor, "*batch n 3"]) -> Bool[Tensor, "*batch"]:
+    """Whether the RCM, in the camera's frame, has fallen into the optical centre.
+
+    Every plane through the optical centre contains p = 0, so this fits any lines of one camera without a residual. It is
+    what least squares returns where the distance of the RCM cannot be seen: one camera, and a laparoscope that does not
+    move.
+    """
+    return torch.linalg.vector_norm(p, dim=-1).mean(-1) < COLLAPSED_MM
+
+
+def lift(statistics: LineStatistics, R: Float[Tensor, "b m 3 3"], t: Float[Tensor, "b m 3"]) -> Float[Tensor, "b m 3"]:
+    """t with a collapsed RCM moved out along the ray that all planes share, to the side where the tips point as imaged."""
+    p = statistics.sample_p[:, None] @ R.mT + t[:, :, None]
+    chosen = collapsed(p)
+    if not bool(chosen.any()):
+        return t
+    _, rays = torch.linalg.eigh(statistics.point_gram[:, :, 9:, 9:].sum(1))
+    shift = (LIFTED_MM * rays[:, None, :, 0]).expand_as(t) - p.mean(-2)
+    ahead, behind = t + shift, t + shift - 2.0 * LIFTED_MM * rays[:, None, :, 0]
+    towards = cheirality(statistics, R, ahead) >= cheirality(statistics, R, behind)
+    return torch.where(chosen[..., None], torch.where(towards[..., None], ahead, behind), t)
 
 
 def _mean_distance(statistics: LineStatistics, R: Tensor, t: Tensor) -> Tensor:

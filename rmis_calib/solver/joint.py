@@ -12,7 +12,7 @@ from rmis_calib.solver.initialise import contour_starts, find_candidates
 from rmis_calib.solver.measurements import Packed, pack
 from rmis_calib.solver.normal import NoiseModel, camera_distance2, with_prior
 from rmis_calib.solver.problem import Problem
-from rmis_calib.solver.refine import Refined, levenberg_marquardt, polish, solve_system
+from rmis_calib.solver.refine import Refined, levenberg_marquardt, polish
 from rmis_calib.solver.residuals import State, predict_shaft
 from rmis_calib.solver.robust import anneal, chi2_quantile, inlier_weight, truncated_cost
 from rmis_calib.solver.robust_start import robust_candidates
@@ -34,6 +34,8 @@ SAMPLE_MOTIONS = 512
 """Motions on which outliers are annealed and noise levels estimated; all motions are classified afterwards."""
 NOISE_ROUNDS = 2
 MAX_PASSES = 12
+MOSTLY_PRIOR = 0.9
+"""Share of a direction's information from which it is the prior's: a bias there is not corrected."""
 INFORMATION_FLOOR = 0.05
 """Least part of the raw information that the bias correction leaves in any direction. Where it would leave less, nearly all the information is noise in
 the Jacobian; sigma is then reported at least 4.5 times the raw one, which no verdict accepts."""
@@ -111,9 +113,9 @@ def _finish(
     information = normal.H
     if settings.bias_correction:
         expected = expected_score(packed, state, layout, noise, settings.bias_motions, settings.chunk, settings.seed, weight)
-        delta, _ = solve_system(normal.H, normal.g - expected.g)
-        state, bias = state.moved(layout.step(delta)), -delta
         prior = with_prior(replace(normal, H=torch.zeros_like(normal.H)), layout, state).H
+        delta = _seen_step(normal.H, prior, normal.g - expected.g)
+        state, bias = state.moved(layout.step(delta)), -delta
         information = floored_information(normal.H - prior, expected.H) + prior
     weight_all = torch.ones_like(packed.line_ok[0], dtype=packed.p.dtype) if weight is None else weight
     scale = information.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
@@ -141,6 +143,17 @@ def _finish(
         bias=bias,
         history=refined.history,
     )
+
+
+def _seen_step(H: Float[Tensor, "b p p"], prior: Float[Tensor, "b p p"], g: Float[Tensor, "b p"]) -> Float[Tensor, "b p"]:
+    """-H^-1 g without the directions in which the data add nothing to the prior: there a simulated score is rounding."""
+    scale = H.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
+    both = scale[:, :, None] * scale[:, None]
+    values, vectors = torch.linalg.eigh(torch.nan_to_num(H * both))
+    from_prior = ((vectors.mT @ (prior * both)) * vectors.mT).sum(-1)
+    along = (vectors.mT @ (torch.nan_to_num(g) * scale)[..., None])[..., 0]
+    along = torch.where(from_prior < MOSTLY_PRIOR * values, along / values, 0.0)
+    return -scale * (vectors @ along[..., None])[..., 0]
 
 
 def floored_information(H: Float[Tensor, "b p p"], expected: Float[Tensor, "b p p"]) -> Float[Tensor, "b p p"]:

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -194,6 +195,8 @@ class _Reader:
         value = self.arrays.get(key)
         if value is None:
             raise ObservationsError(where=key, expected="an array", found="nothing")
+        if isinstance(value, np.ndarray) and not value.flags.writeable:
+            value = value.copy()  # torch cannot share read-only memory
         return torch.as_tensor(value, dtype=self.dtype, device=self.device)
 
     def filled(self, key: str, *tail: int) -> Tensor:

@@ -17,6 +17,8 @@ from rmis_calib.solver.unknowns import Layout
 
 INITIAL_DAMPING = 1e-4
 """Relative to the diagonal of H; starts are near a minimum, so nearly Gauss-Newton."""
+NULL_RIDGE = 1e-13
+"""Added to the unit diagonal of a scaled system: a direction that the data do not see at all would else take its step from rounding."""
 MAX_DAMPING = 1e8
 """Past this no step goes downhill to the working precision: the loop has stalled."""
 
@@ -41,9 +43,9 @@ def solve_system(H: Float[Tensor, "b p p"], g: Float[Tensor, "b p"], damping: Te
     scaled = H * scale[..., :, None] * scale[..., None, :]
     if damping is not None:
         scaled = scaled + torch.diag_embed(damping[:, None].expand_as(scale))
-    factor, info = torch.linalg.cholesky_ex(torch.nan_to_num(scaled, nan=0.0))
-    solvable = (info == 0) & torch.isfinite(H).all(-1).all(-1) & torch.isfinite(g).all(-1)
     identity = torch.eye(H.shape[-1], dtype=H.dtype, device=H.device)
+    factor, info = torch.linalg.cholesky_ex(torch.nan_to_num(scaled, nan=0.0) + NULL_RIDGE * identity)
+    solvable = (info == 0) & torch.isfinite(H).all(-1).all(-1) & torch.isfinite(g).all(-1)
     factor = torch.where(solvable[:, None, None], factor, identity)
     step = -scale * torch.cholesky_solve((g * scale)[..., None], factor)[..., 0]
     return torch.where(solvable[:, None], step, 0.0), solvable

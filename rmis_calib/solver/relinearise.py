@@ -9,7 +9,6 @@ candidates are one batch. It is the cross-correlation of the two motions, with t
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -59,8 +58,7 @@ def solve_relinearised(problem: Problem, settings: SolverSettings, kinematics: K
         clock_at = _at(problem.clock_at, fit.state.clock)
         problem = kinematics(joint_at + fit.state.joint_offset, clock_at + fit.state.clock)
         fit = solve_joint(problem, settings, fit)
-    joint_at, clock_at = _at(problem.joint_offset_at, fit.state.joint_offset), _at(problem.clock_at, fit.state.clock)
-    return replace(fit, state=replace(fit.state, joint_offset=joint_at + fit.state.joint_offset, clock=clock_at + fit.state.clock), problem=problem)
+    return fit
 
 
 def _at(value: Tensor | None, like: Tensor) -> Tensor:
