@@ -126,8 +126,7 @@ def _capture_times(nominal_s: Array, config: SynthConfig, generator: np.random.G
     if noise.dropped_fraction and config.motion.kind == "smooth":
         arrived = np.cumsum(generator.geometric(1.0 - noise.dropped_fraction, len(times))) - 1
         times = nominal_s[0] + arrived / config.motion.frame_rate_hz
-    jittered = times + noise.frame_jitter_s * generator.standard_normal(len(times))
-    return np.maximum.accumulate(jittered) + 1e-6 * np.arange(len(times))
+    return np.sort(times + noise.frame_jitter_s * generator.standard_normal(len(times)))
 
 
 def comfortably_in_view(camera: Camera, p: Array) -> Array:

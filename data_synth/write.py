@@ -90,10 +90,8 @@ def _write_tables(folder: Path, world: World, truths: dict[str, SideTruth]) -> N
     _write_yaml(folder / "stereo.yaml", _stereo(world, generator))
     header, rows, offsets = _joint_log(world, logged, generator)
     _write_csv(folder / "joints.csv", header, rows)
-    recorded_s = world.frame_times_s + config.noise.timestamp_noise_s * generator.standard_normal(
-        len(world.frame_times_s)
-    )
-    times = ((i, _text(t)) for i, t in enumerate(np.maximum.accumulate(recorded_s) + 1e-6 * np.arange(len(recorded_s))))
+    timing_error_s = config.noise.timestamp_noise_s * generator.standard_normal(len(world.frame_times_s))
+    times = ((i, _text(t)) for i, t in enumerate(np.sort(world.frame_times_s + timing_error_s)))
     _write_csv(folder / "frame_times.csv", ["frame", "timestamp_s"], times)
     _write_head_points(folder / "head_points.csv", world, truths, generator)
     _write_yaml(folder / "ground_truth.yaml", ground_truth(world) | {"joint_offsets": offsets})
