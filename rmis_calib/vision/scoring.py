@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rmis_calib.vision.runs import first_on, last_on, masked_mean, masked_median, run_lengths
+from rmis_calib.vision.runs import bridge, first_on, last_on, masked_mean, masked_median, run_any, run_lengths
 from rmis_calib.vision.settings import DetectorSettings
 from rmis_calib.vision.strips import SmallPicture, Strips
 
@@ -127,7 +127,8 @@ def inspect(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -
     on = p.open & (p.step > settings.min_contrast) & (p.inner < p.outer - 0.5 * settings.min_contrast)
     tone = masked_median(p.inner, on)
     surround = masked_median(p.outer, on)
-    on &= p.inner < (tone + _SHAFT_SHARE * (surround - tone).clamp(min=0.0))[..., None]
+    edged = on
+    on = on & (p.inner < (tone + _SHAFT_SHARE * (surround - tone).clamp(min=0.0))[..., None])
     width = masked_mean(p.width, on)
     length = run_lengths(on) * spacing
     on &= length > (0.5 * width).clamp(min=2.5 * spacing)[..., None]
@@ -135,8 +136,9 @@ def inspect(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -
     carries_end = torch.where(carries_end.any(-1, keepdim=True), carries_end, on)
 
     reach = 0.5 * width + 3 * spacing
-    low_gap = first_on(t, on) - first_on(t, p.seen)
-    high_gap = last_on(t, p.seen) - last_on(t, on)
+    contoured = edged & run_any(bridge(edged, 0.7 * width / spacing), on)
+    low_gap = first_on(t, contoured) - first_on(t, p.seen)
+    high_gap = last_on(t, p.seen) - last_on(t, contoured)
     low_border, high_border = low_gap < reach, high_gap < reach
     flip = (high_border & ~low_border) | ((high_border == low_border) & (high_gap < low_gap))
     start = torch.where(flip, -last_on(t, on), first_on(t, on))

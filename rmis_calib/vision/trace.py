@@ -127,10 +127,8 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
     on &= tone[..., :7].median(-1).values - sides.brightness.mean(2) < MAX_BRIGHTER
     on &= (step > settings.min_contrast) & (inner < outer - 0.5 * settings.min_contrast)
     surround = masked_median(torch.where(on, outer, 0.0) - inner, on)
-    on &= _own_tone(inner, outer, on, on)
-
-    line = strips.contour(stations)
-    wander = smooth_over(sides.lateral - line, (on[:, :, None] & sides.seen))
+    edged = on
+    on = on & _own_tone(inner, outer, on, on)
     width = masked_median(left - right, on & sides.seen.all(2))
     on &= run_lengths(on) * spacing > (0.4 * width).clamp(min=2.5 * spacing)[..., None]
     # The end may lie on a stretch whose contours do not continue these lines (a sleeve, a lens that bends them): there
@@ -139,13 +137,16 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
     far = torch.where(inner_seen[..., 7:], value[..., 7:], inf).amin(-1)
     darker = centre_seen & torch.isfinite(far) & (inner < far - settings.min_contrast) & strips.valid[..., None]
     main = longest_run(on, 0.7 * width / spacing)
+    to_border, borders = _enter(t, edged, main, centre_seen, width)
+    on, main = on | to_border, main | to_border
+    line = strips.contour(stations)
+    wander = smooth_over(sides.lateral - line, (on[:, :, None] & sides.seen))
     beyond = darker & ~run_any(bridge(darker | on, 0.3 * width / spacing), main)
     band = on | (beyond & (run_range(inner) < _RUN_UNEVENNESS) & _own_tone(inner, far, beyond, on))
     long_runs = band & (run_lengths(band) * spacing > settings.end_run_widths * width[..., None] - spacing)
-    carries_end = torch.where(long_runs.any(-1, keepdim=True), long_runs, on)
+    carries_end = torch.where(long_runs.any(-1, keepdim=True), long_runs, main)
     contrast = masked_median(torch.where(torch.isfinite(step), step, 0.0), on)
     length = on.float().sum(-1) * spacing
-    start_at_border, end_at_border = _borders(t, on, centre_seen, width)
     whole = Trace(
         strips=strips,
         t=t,
@@ -155,8 +156,8 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
         lateral=line + wander,
         start=first_on(t, on),
         end=last_on(t, carries_end),
-        start_at_border=start_at_border,
-        end_at_border=end_at_border,
+        start_at_border=borders[0],
+        end_at_border=borders[1],
         width=width,
         length=length,
         contrast=contrast,
@@ -202,12 +203,26 @@ def _own_tone(
     return same_shaft & steady
 
 
-def _borders(
-    t: Float[Tensor, " s"], on: Bool[Tensor, "b k s"], seen: Bool[Tensor, "b k s"], width: Float[Tensor, "b k"]
-) -> tuple[Bool[Tensor, "b k"], Bool[Tensor, "b k"]]:
-    """Whether the shaft reaches the end of the field of view on its low and on its high side."""
-    reach = 0.5 * width + 3 * (t[1] - t[0])
-    return first_on(t, on) - first_on(t, seen) < reach, last_on(t, seen) - last_on(t, on) < reach
+def _enter(
+    t: Float[Tensor, " s"],
+    edged: Bool[Tensor, "b k s"],
+    main: Bool[Tensor, "b k s"],
+    seen: Bool[Tensor, "b k s"],
+    width: Float[Tensor, "b k"],
+) -> tuple[Bool[Tensor, "b k s"], tuple[Bool[Tensor, "b k"], Bool[Tensor, "b k"]]]:
+    """Stretch between the shaft's plain part and the border it enters at; whether it reaches the low, the high border.
+
+    Near the scope's light a shaft may be as bright as a wrist. On the side where its contours run out of the picture it
+    is shaft all the same.
+    """
+    step = t[1] - t[0]
+    contoured = edged & run_any(bridge(edged, 0.7 * width / step), main)
+    reach = 0.5 * width + 3 * step
+    low = first_on(t, contoured) - first_on(t, seen) < reach
+    high = last_on(t, seen) - last_on(t, contoured) < reach
+    before = contoured & (t < first_on(t, main)[..., None]) & (low & ~high)[..., None]
+    after = contoured & (t > last_on(t, main)[..., None]) & (high & ~low)[..., None]
+    return before | after, (low, high)
 
 
 def _towards_tip(
