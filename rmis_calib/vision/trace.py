@@ -145,6 +145,7 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
     band = on | (beyond & (run_range(inner) < _RUN_UNEVENNESS) & _own_tone(inner, far, beyond, on))
     long_runs = band & (run_lengths(band) * spacing > settings.end_run_widths * width[..., None] - spacing)
     carries_end = torch.where(long_runs.any(-1, keepdim=True), long_runs, main)
+    down, up = (_same_tone(t, inner, main, centre_seen, surround, width, high) for high in (False, True))
     contrast = masked_median(torch.where(torch.isfinite(step), step, 0.0), on)
     length = on.float().sum(-1) * spacing
     whole = Trace(
@@ -155,7 +156,7 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
         sides=on[:, :, None] & sides.seen,
         lateral=line + wander,
         start=first_on(t, on),
-        end=last_on(t, carries_end),
+        end=last_on(t, carries_end | up),
         start_at_border=borders[0],
         end_at_border=borders[1],
         width=width,
@@ -163,7 +164,29 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
         contrast=contrast,
         surround=surround,
     )
-    return _towards_tip(whole, first_on(t, carries_end), last_on(t, on), t, centre_seen)
+    return _towards_tip(whole, first_on(t, carries_end | down), last_on(t, on), t, centre_seen)
+
+
+def _same_tone(
+    t: Float[Tensor, " s"],
+    inner: Float[Tensor, "b k s"],
+    main: Bool[Tensor, "b k s"],
+    seen: Bool[Tensor, "b k s"],
+    surround: Float[Tensor, "b k"],
+    width: Float[Tensor, "b k"],
+    high: bool,
+) -> Bool[Tensor, "b k s"]:
+    """Stations beyond the contoured stretch, on its high or low side, at which the inside keeps its tone.
+
+    Before a dark cavity, under blood or a shadow a shaft loses its contours but not its own tone.
+    """
+    step = t[1] - t[0]
+    last = (last_on if high else first_on)(t, main)[..., None]
+    distance = t - last if high else last - t
+    tone = masked_median(inner, main & (distance > -6 * step))
+    same = seen & (inner < (tone + _TONE_SHARE * surround.clamp(min=0.2))[..., None])
+    reached = run_any(bridge(same | main, 0.3 * width / step), main & (distance > -2 * step))
+    return reached & same & (distance > 0)
 
 
 def straighten(traced: Trace) -> Strips:
