@@ -166,7 +166,7 @@ def _solve_choice(
 def _choose_again(run: CalibrationRun) -> tuple[Choice, ...] | None:
     """Candidates nearest to what the first answer predicts; None when there is no answer to predict from."""
     predictions = [run.predicted_contours(view) for view in run.views]
-    if run.solution is None or any(prediction is None for prediction in predictions):
+    if run.result.status not in ("ok", "weak") or any(prediction is None for prediction in predictions):
         return None
     return tuple(
         consistent_choice(select_frames(view.detections, run.poses.frames), prediction)

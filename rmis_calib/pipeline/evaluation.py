@@ -135,6 +135,8 @@ def _errors(result: CalibrationResult, truth: RigidTransform) -> tuple[float, fl
     dt = truth.t - found[..., :3, 3]
     sigmas = None
     if result.covariance is not None:
-        error = np.concatenate([dphi.numpy(), dt.numpy()])
-        sigmas = math.sqrt(error @ np.linalg.solve(result.covariance, error))
+        # Scaled to unit variances: radians and millimetres, and directions that are hardly known, differ by 1e12.
+        scale = np.sqrt(np.diag(result.covariance))
+        error = np.concatenate([dphi.numpy(), dt.numpy()]) / scale
+        sigmas = math.sqrt(error @ np.linalg.pinv(result.covariance / np.outer(scale, scale), hermitian=True) @ error)
     return math.degrees(float(dphi.norm())), float(dt.norm()), sigmas

@@ -196,7 +196,9 @@ def _compete(
         return first.state, first.noise, False
     race = _race(problem, sample, R, t, assumed, free, settings, robust=False)
     state, noise = race.state, race.noise
-    if settings.robust == "off" or not (race.outliers or settings.robust == "on"):
+    # A poor fit hides outliers where the noise levels are to be estimated: they are raised until it looks good.
+    suspect = race.outliers or settings.robust == "on" or (_any(free) and not race.settled)
+    if settings.robust == "off" or not suspect:
         return state, noise, False
     sub = problem.select_motions(index)
     candidates = robust_candidates(sub, settings.grid, COMPETING_MINIMA)

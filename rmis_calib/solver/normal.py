@@ -49,14 +49,14 @@ class Normal:
         chi2: r^T S^-1 r.
         rows: number of measured rows.
         distance2: r^T S^-1 r of each motion.
-        factor: the eliminated systems, kept for `frozen_chi2` when asked for.
+        factor: the eliminated systems, for `frozen_chi2`, when asked for.
     """
 
     H: Float[Tensor, "b p p"]
     g: Float[Tensor, "b p"]
     chi2: Float[Tensor, " b"]
     rows: Float[Tensor, " b"]
-    distance2: Float[Tensor, "b n"] | None = None
+    distance2: Float[Tensor, "b n"]
     factor: Tensor | None = None
 
 
@@ -111,7 +111,7 @@ def normal_equations(
 
     Args:
         weight: (c, b, n) in (0, 1] of each camera's measurements of a motion.
-        keep: also return the factor and each motion's Mahalanobis distance.
+        keep: also return the factor.
     """
     rows, shaft = linearise(packed, state)
     k, b, n = rows.r.shape
@@ -129,7 +129,7 @@ def normal_equations(
         g=gram[:, :p, p],
         chi2=gram[:, p, p],
         rows=packed.rows_ok.sum((0, 2)).to(gram.dtype),
-        distance2=white[:, -1].square().sum(0) if keep else None,
+        distance2=white[:, -1].square().sum(0),
         factor=augmented[:, :k].clone() if keep else None,
     )
 
@@ -165,20 +165,20 @@ def accumulate(
     for b in range(0, trials, step_b):
         bs = slice(b, min(b + step_b, trials))
         part_state, part_layout, part_noise = state.take(bs), layout.take(bs), noise.take(bs)
-        total = None
+        parts = []
         for n in range(0, motions, step_n):
             ns = slice(n, min(n + step_n, motions))
-            part = normal_equations(
-                packed.narrow(bs, ns), part_state, part_layout, part_noise, None if weight is None else weight[:, bs, ns]
-            )
-            total = part if total is None else _add(total, part)
-        per_trial.append(total)
-    joined = Normal(**{name: torch.cat([getattr(part, name) for part in per_trial]) for name in ("H", "g", "chi2", "rows")})
+            part_weight = None if weight is None else weight[:, bs, ns]
+            parts.append(normal_equations(packed.narrow(bs, ns), part_state, part_layout, part_noise, part_weight))
+        per_trial.append(_joined(parts))
+    joined = Normal(**{name: torch.cat([getattr(part, name) for part in per_trial]) for name in ("H", "g", "chi2", "rows", "distance2")})
     return with_prior(joined, layout, state)
 
 
-def _add(a: Normal, b: Normal) -> Normal:
-    return Normal(H=a.H + b.H, g=a.g + b.g, chi2=a.chi2 + b.chi2, rows=a.rows + b.rows)
+def _joined(parts: list[Normal]) -> Normal:
+    """Parts of the motions of the same trials."""
+    sums = {name: torch.stack([getattr(part, name) for part in parts]).sum(0) for name in ("H", "g", "chi2", "rows")}
+    return Normal(**sums, distance2=torch.cat([part.distance2 for part in parts], dim=-1))
 
 
 def camera_distance2(

@@ -147,4 +147,4 @@ def _where(chosen: Tensor, a: Normal, b: Normal) -> Normal:
     def pick(x: Tensor, y: Tensor) -> Tensor:
         return torch.where(chosen.reshape(-1, *(1,) * (x.ndim - 1)), x, y)
 
-    return replace(b, **{name: pick(getattr(a, name), getattr(b, name)) for name in ("H", "g", "chi2", "rows")})
+    return replace(b, **{name: pick(getattr(a, name), getattr(b, name)) for name in ("H", "g", "chi2", "rows", "distance2")})

@@ -22,7 +22,7 @@ REWEIGHTINGS = 15
 
 def robust_candidates(problem: Problem, grid: int, minima: int) -> Candidates:
     """Distinct minima of sum |n.R v|, each with the t that minimises sum |n.(R p + t + o)|; best by absolute cost."""
-    n, x, ok = plane_normals(problem)
+    n, _, ok = plane_normals(problem)
     b = n.shape[0]
     v = (problem.arm_T_rcm[..., :3, :3] @ problem.rcm_v_axis[..., None])[..., 0][:, None].expand_as(n).flatten(1, 2)
     p = problem.arm_T_rcm[..., :3, 3][:, None].expand_as(n).flatten(1, 2)
@@ -41,7 +41,7 @@ def robust_candidates(problem: Problem, grid: int, minima: int) -> Candidates:
         R = (rotvec_to_matrix(newton_step(gradient, hessian, gauss_newton))[:, 0] @ R.flatten(0, 1)).unflatten(0, (b, -1))
     cost = (vec(R) @ rows.mT).abs().sum(-1)
     R, cost = distinct_minima(R, cost, minima)
-    statistics = LineStatistics.from_normals(n, x, ok, problem)
+    statistics = LineStatistics.from_problem(problem)
     offset = statistics.offset[:, :, None].expand_as(n).flatten(1, 2)
     t, gap = _absolute_translation(normals, p, offset, known, R)
     reach = torch.linalg.vector_norm(p.mean(1)[:, None, None] @ R.mT + t[:, :, None], dim=-1)[..., 0].clamp_min(1.0)

@@ -100,7 +100,7 @@ class SolverSettings:
     bias_correction: bool = True
     """Subtract the second-order bias of errors in variables, from antithetic simulations at the estimate."""
     bias_motions: Count = 512
-    """Least number of simulated pairs that the bias is averaged over (a quarter of the motions where that is more). Antithetic pairs know it from 512 to
+    """Least number of simulated pairs that the bias is averaged over (a sixteenth of the motions where that is more). Antithetic pairs know it from 512 to
     a few per cent of sigma at realistic noise."""
     grid: Annotated[int, Field(ge=24, le=20000)] = 576
     """Rotations of the covering grid."""
@@ -114,7 +114,7 @@ class SolverSettings:
     """Motions that the starts compete on; all motions refine the winner."""
     thin_to: Count | None = None
     """Keep only this many most informative motions (D-optimal); the loss in information is stated."""
-    chunk: Annotated[int, Field(ge=256)] = 8192
+    chunk: Annotated[int, Field(ge=256)] = 4096
     """Motions (times trials) that are in work at once: bounds memory."""
     seed: int = 0
     """Seed of the simulations of the bias correction."""

@@ -35,7 +35,7 @@ class LineStatistics:
     Attributes:
         rotation_gram: of kron(v, n).
         point_gram: of kron([p; 1], n), mm^2 in the blocks of p.
-        turn: sum of n kron [p x v; v]^T, (3, 6).
+        turn: sum of n [p x v; v]^T, (3, 6).
         count: motions summed.
         offset: o of the left camera, zero for the right one, mm.
         sample_n, sample_p, sample_v, sample_x: up to SAMPLE motions as they are; NaN rows for what was not measured.
@@ -76,36 +76,58 @@ class LineStatistics:
         return LineStatistics(**{f.name: getattr(self, f.name)[:, one] if f.name not in ("sample_p", "sample_v") else getattr(self, f.name) for f in fields(self)})
 
     @classmethod
-    def from_problem(cls, problem: Problem, weight: Float[Tensor, "b c n"] | None = None) -> "LineStatistics":
-        """Sums of a problem with one trial axis; lines that were not measured do not count.
-
-        Args:
-            weight: of each line; 1 when absent.
-        """
-        n, x, ok = plane_normals(problem)
-        return cls.from_normals(n, x, ok, problem, weight)
-
-    @classmethod
-    def from_normals(cls, n: Tensor, x: Tensor, ok: Tensor, problem: Problem, weight: Tensor | None = None) -> "LineStatistics":
-        """The same from normals and rays that are already there (`plane_normals`)."""
-        w = ok.to(n.dtype) if weight is None else ok * weight
-        p, v = problem.arm_T_rcm[..., :3, 3], _arm_v(problem)
-        half = (n * w.sqrt()[..., None]).permute(0, 1, 3, 2)  # (b, c, 3, n)
-        point = torch.cat((p, torch.ones_like(p[..., :1])), dim=-1).mT  # (b, 4, n)
-        turn = torch.cat((torch.linalg.cross(p, v), v), dim=-1)
+    def from_problem(cls, problem: Problem, chunk: int = 16384) -> "LineStatistics":
+        """Sums of a problem with one trial axis, `chunk` motions (times trials) at a time; lines that were not measured do not count."""
+        trials, motions = problem.n_trials, problem.n_motions
+        step_n = min(motions, chunk)
+        step_b = max(1, chunk // step_n)
+        sums = []
+        for b in range(0, trials, step_b):
+            parts = [
+                _sums(problem, slice(b, min(b + step_b, trials)), slice(n, min(n + step_n, motions))) for n in range(0, motions, step_n)
+            ]
+            total = parts[0]
+            for part in parts[1:]:
+                total = [x.add_(y) for x, y in zip(total, part, strict=True)]
+            sums.append(total)
+        rotation, point, turn, count = (torch.cat([part[i] for part in sums]) for i in range(4))
         R_Z, t_Z = problem.camera_T_camera_right[..., :3, :3], problem.camera_T_camera_right[..., :3, 3]
-        stride = max(1, -(-problem.n_motions // SAMPLE))
+        sample = problem.select_motions(slice(None, None, max(1, -(-motions // SAMPLE))))
+        n, x, ok = plane_normals(sample)
         return cls(
-            rotation_gram=_gram(v.mT, half),
-            point_gram=_gram(point, half),
-            turn=(half * w.sqrt()[:, :, None]) @ turn[:, None],
-            count=w.sum(-1),
+            rotation_gram=rotation,
+            point_gram=point,
+            turn=turn,
+            count=count,
             offset=(R_Z.mT @ t_Z[..., None])[..., 0],
-            sample_n=torch.where(ok[..., ::stride, None], n[..., ::stride, :], torch.nan),
-            sample_p=p[:, ::stride],
-            sample_v=v[:, ::stride],
-            sample_x=x[..., ::stride, :],
+            sample_n=torch.where(ok[..., None], n, torch.nan),
+            sample_p=sample.arm_T_rcm[..., :3, 3],
+            sample_v=_arm_v(sample),
+            sample_x=x,
         )
+
+
+def _sums(problem: Problem, trials: slice, motions: slice) -> list[Tensor]:
+    """Gram matrices, turn and count of some motions; vectors by component, so that every operation runs along memory."""
+    axis, T = problem.axis_xy[trials, :, motions], problem.arm_T_rcm[trials, motions]
+    x0, y0, x1, y1 = (axis[..., i, j].contiguous() for i in (0, 1) for j in (0, 1))
+    ok = torch.isfinite(x0 + y0 + x1 + y1) & problem.valid[trials, :, motions]
+    n = [y0 - y1, x1 - x0, x0 * y1 - y0 * x1]
+    scale = torch.where(ok, (n[0].square() + n[1].square() + n[2].square()).clamp_min(1e-300).rsqrt(), 0.0)
+    n = [torch.where(ok, component, 0.0) * scale for component in n]
+    if problem.n_cameras == 2:  # n R = R^T n, into camera_right
+        R = problem.camera_T_camera_right[trials, :, :3, :3, None]
+        n = [n[0] * R[:, :, 0, i] + n[1] * R[:, :, 1, i] + n[2] * R[:, :, 2, i] for i in range(3)]
+    n = torch.stack(n, dim=2)  # (b, c, 3, n)
+    axis_rcm = problem.rcm_v_axis[trials, motions]
+    v = [sum(T[..., i, k] * axis_rcm[..., k] for k in range(3)) for i in range(3)]
+    p = [T[..., i, 3] for i in range(3)]
+    one = torch.ones_like(p[0])
+    left = torch.stack((*v, *p, one), dim=1)  # (b, 7, n)
+    rows = (left[:, None, :, None] * n[:, :, None]).flatten(2, 3)  # (b, c, 21, n): kron(v, n), kron([p; 1], n)
+    moment = [p[1] * v[2] - p[2] * v[1], p[2] * v[0] - p[0] * v[2], p[0] * v[1] - p[1] * v[0]]
+    turn = n @ torch.stack((*moment, *v), dim=1)[:, None].mT
+    return [rows[:, :, :9] @ rows[:, :, :9].mT, rows[:, :, 9:] @ rows[:, :, 9:].mT, turn, ok.sum(-1).to(n.dtype)]
 
 
 def plane_normals(problem: Problem) -> tuple[Float[Tensor, "b c n 3"], Float[Tensor, "b c n 3"], Tensor]:
@@ -121,9 +143,3 @@ def plane_normals(problem: Problem) -> tuple[Float[Tensor, "b c n 3"], Float[Ten
 
 def _arm_v(problem: Problem) -> Float[Tensor, "b n 3"]:
     return (problem.arm_T_rcm[..., :3, :3] @ problem.rcm_v_axis[..., None])[..., 0]
-
-
-def _gram(left: Float[Tensor, "b i n"], right: Float[Tensor, "b c 3 n"]) -> Float[Tensor, "b c k k"]:
-    """Gram matrix of kron(left, right) over motions."""
-    rows = (left[:, None, :, None, :] * right[:, :, None]).flatten(2, 3)  # (b, c, 3 i, n)
-    return rows @ rows.mT
