@@ -78,7 +78,8 @@ def _profiles(picture: SmallPicture, strips: Strips, t: Float[Tensor, " s"], nar
     lateral = torch.cat([inner_y, rim_y, beyond_y], -1)
     value, seen, tone = picture.read(strips.points(stations[..., None].expand_as(lateral), lateral))
     rim, beyond = value[..., _INNER : _INNER + _RIM], value[..., _INNER + _RIM :]
-    inner = value[..., :_INNER].median(-1).values
+    # The third darkest of seven: a glare stripe may cover half of the width.
+    inner = value[..., :_INNER].kthvalue(3, -1).values
     inf = value.new_tensor(torch.inf)
     rim_seen = seen[..., _INNER : _INNER + _RIM]
     left_seen, right_seen = rim_seen[..., :2].all(-1), rim_seen[..., 2:].all(-1)
@@ -88,12 +89,26 @@ def _profiles(picture: SmallPicture, strips: Strips, t: Float[Tensor, " s"], nar
     outer = torch.minimum(torch.where(left_seen, rim[..., 0], inf), torch.where(right_seen, rim[..., 3], inf))
     one_side, both_sides = left_seen | right_seen, left_seen & right_seen
     middle = 0.5 * (inner + outer)[..., None]
-    free = (beyond > middle) | ~seen[..., _INNER + _RIM :]
-    purity = (value[..., :_INNER] < middle).float().mean(-1) * free.float().mean(-1)
+    glare = _glare(value, tone)
+    # Beyond a contour there is neither more shaft nor the glare on it: else the strip is a part of a wider one.
+    brighter_side = torch.maximum(rim[..., 0], rim[..., 3])[..., None]
+    open_beyond = torch.maximum(middle, inner[..., None] + 0.35 * (brighter_side - inner[..., None]))
+    free = ((beyond > open_beyond) & ~glare[..., _INNER + _RIM :]) | ~seen[..., _INNER + _RIM :]
+    own = (value[..., :_INNER] < middle) | glare[..., :_INNER]
+    purity = own.float().mean(-1) * free.float().mean(-1)
     centre_seen = seen[..., _INNER // 2]
-    brighter = tone[..., :_INNER].median(-1).values - 0.5 * (tone[..., _INNER] + tone[..., _INNER + 3])
+    brighter = tone[..., :_INNER].kthvalue(3, -1).values - 0.5 * (tone[..., _INNER] + tone[..., _INNER + 3])
     is_open = centre_seen & one_side & (width > narrowest_px) & strips.valid[..., None] & (brighter < MAX_BRIGHTER)
     return _Profiles(inner, outer, step, purity, is_open, both_sides, centre_seen, width)
+
+
+def _glare(value: Float[Tensor, "b k s n"], tone: Float[Tensor, "b k s n"]) -> Bool[Tensor, "b k s n"]:
+    """Points that are brighter than the surroundings of the strip and have lost their tint: light reflected by a shaft."""
+    tint = value - tone
+    sides = [_INNER, _INNER + 3]
+    tinted = tint[..., sides].amax(-1, keepdim=True)
+    bright = tone[..., sides].amin(-1, keepdim=True)
+    return (tint < 0.4 * tinted) & (tone > bright + 0.1) & (tinted > 0.15)
 
 
 def screen(picture: SmallPicture, strips: Strips, settings: DetectorSettings, count: int) -> Strips:
@@ -109,7 +124,7 @@ def screen(picture: SmallPicture, strips: Strips, settings: DetectorSettings, co
     middle = 0.5 * (left + right)
     lateral = torch.stack([left + near, middle + 0.25 * width, middle, middle - 0.25 * width, right - near], -1)
     value, seen, _ = picture.read(strips.points(stations[..., None].expand_as(lateral), lateral))
-    inner = value[..., 1:4].median(-1).values
+    inner = value[..., 1:4].amin(-1)
     left_rise = torch.where(seen[..., 0], value[..., 0] - inner, torch.inf)
     right_rise = torch.where(seen[..., 4], value[..., 4] - inner, torch.inf)
     rise = torch.minimum(left_rise, right_rise)

@@ -14,7 +14,7 @@ class DetectorSettings:
     """Most shafts reported a frame, best first."""
     small_width_px: int = Field(default=320, ge=120, le=1280)
     """Width, px, of the small picture on which shafts are searched for; sub-pixel work is at full resolution."""
-    min_width_fraction: float = Field(default=0.012, gt=0, lt=1)
+    min_width_fraction: float = Field(default=0.02, gt=0, lt=1)
     """Narrowest shaft, as a fraction of the picture's width."""
     max_width_fraction: float = Field(default=0.30, gt=0, lt=1)
     """Widest shaft, as a fraction of the picture's width."""

@@ -124,7 +124,7 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
     outer = torch.where(sides.seen, sides.outer, inf).amin(2)
     wide = left - right > settings.min_width_fraction * picture.width_px
     on = centre_seen & sides.seen.any(2) & wide & strips.valid[..., None]
-    on &= tone[..., :7].median(-1).values - sides.brightness.mean(2) < MAX_BRIGHTER
+    on &= tone[..., :7].kthvalue(3, -1).values - sides.brightness.mean(2) < MAX_BRIGHTER
     on &= (step > settings.min_contrast) & (inner < outer - 0.5 * settings.min_contrast)
     surround = masked_median(torch.where(on, outer, 0.0) - inner, on)
     edged = on
