@@ -48,7 +48,7 @@ def locate(
     colours, seen = picture.read(strips.points(t[:, :, None].expand_as(y), y))  # (b, k, rows, n, 3)
     seen = seen.all(2)
     profile = _separate(colours, seen)
-    index, rise, found = _first_rise(profile.mean(2), seen)
+    index, rise, found = _first_rise(_darker_rows(profile), seen)
     shift, agreement = _refine(profile, index, (blur_px / step).clamp(0.5, 3.0))
     place = index.to(t.dtype) - _HALF + shift
     sigma = (agreement * step).clamp(min=floor_px)
@@ -56,9 +56,14 @@ def locate(
     return ShaftEnd(coarse_t + place * step, sigma, found & sharp & strips.valid)
 
 
+def _darker_rows(values: Float[Tensor, "b k r ..."]) -> Float[Tensor, "b k ..."]:
+    """The third lowest over the rows: a glare stripe may be as bright as the wrist, but leaves some rows dark."""
+    return values.kthvalue(3, dim=2).values
+
+
 def _separate(colours: Float[Tensor, "b k r n 3"], seen: Bool[Tensor, "b k n"]) -> Float[Tensor, "b k r n"]:
     """Colours along the direction that leads from the shaft (first third) to what follows (last half)."""
-    mean = torch.where(seen[..., None], colours.mean(2), torch.nan)
+    mean = torch.where(seen[..., None], _darker_rows(colours), torch.nan)
     third = mean.shape[2] // 3
     before = mean[:, :, :third].nanmedian(2).values
     direction = torch.nan_to_num(mean[:, :, third:] - before[:, :, None])
@@ -97,7 +102,9 @@ def _refine(
         window = profile.gather(-1, low) * (1 - share) + profile.gather(-1, low + 1) * share
         fit = torch.einsum("bknd,bkrd->bkrn", solve, window)
         shift = (shift - (fit[..., 2] / fit[..., 1].clamp(min=1e-3)).clamp(-1.5, 1.5)).clamp(-12.0, 12.0)
-    return _on_axis(shift)
+    height = fit[..., 1]
+    plain = height > 0.4 * height.amax(-1, keepdim=True)
+    return _on_axis(shift, plain.to(shift.dtype))
 
 
 def _steepest_near(profile: Float[Tensor, "b k r n"], index: Tensor) -> Float[Tensor, "b k r"]:
@@ -110,16 +117,19 @@ def _steepest_near(profile: Float[Tensor, "b k r n"], index: Tensor) -> Float[Te
     return (slope * near).argmax(-1).to(profile.dtype) - 10
 
 
-def _on_axis(shift: Float[Tensor, "b k r"]) -> tuple[Float[Tensor, "b k"], Float[Tensor, "b k"]]:
+def _on_axis(
+    shift: Float[Tensor, "b k r"], trust: Float[Tensor, "b k r"]
+) -> tuple[Float[Tensor, "b k"], Float[Tensor, "b k"]]:
     """Value at the middle row of a robust parabola through the rows, and its standard deviation."""
     row = torch.linspace(-1, 1, _ROWS, device=shift.device, dtype=shift.dtype)
     columns = torch.stack([torch.ones_like(row), row, row * row], -1)
-    weight = torch.ones_like(shift)
+    weight = trust
     for _ in range(6):
         weighted = columns * weight[..., None]
         inverse = torch.linalg.inv(weighted.mT @ columns + 1e-6 * torch.eye(3, device=shift.device))
         solution = (inverse @ (weighted.mT @ shift[..., None]))[..., 0]
         residual = shift - solution @ columns.mT
-        scale = (1.4826 * residual.abs().median(-1, keepdim=True).values).clamp(min=1e-3)
-        weight = 1.3 / (residual / scale).abs().clamp(min=1.3)
+        size = torch.where(trust > 0, residual.abs(), torch.nan).nanmedian(-1, keepdim=True).values
+        scale = (1.4826 * torch.nan_to_num(size)).clamp(min=1e-3)
+        weight = trust * 1.3 / (residual / scale).abs().clamp(min=1.3)
     return solution[..., 0], scale[..., 0] * inverse[..., 0, 0].clamp(min=0.0).sqrt()

@@ -103,7 +103,7 @@ def _profiles(picture: SmallPicture, strips: Strips, t: Float[Tensor, " s"], nar
 
 
 def _glare(value: Float[Tensor, "b k s n"], tone: Float[Tensor, "b k s n"]) -> Bool[Tensor, "b k s n"]:
-    """Points that are brighter than the surroundings of the strip and have lost their tint: light reflected by a shaft."""
+    """Points brighter than the surroundings of the strip that have lost their tint: light reflected by a shaft."""
     tint = value - tone
     sides = [_INNER, _INNER + 3]
     tinted = tint[..., sides].amax(-1, keepdim=True)
