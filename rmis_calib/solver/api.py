@@ -9,6 +9,7 @@ from torch import Tensor
 
 from rmis_calib.errors import InsufficientDataError, ObservationsError
 from rmis_calib.geometry.rigid import rigid_from_rotation_translation
+from rmis_calib.solver.competition import cheirality
 from rmis_calib.solver.initialise import COLLAPSED_MM, collapsed, find_candidates
 from rmis_calib.solver.joint import JointFit, solve_joint
 from rmis_calib.solver.measurements import END, HEAD, LINE, Packed, pack
@@ -25,6 +26,8 @@ from rmis_calib.solver.unknowns import TRANSLATION_SIGMA_MM, UNITS, Nominal, ini
 from rmis_calib.solver.variance import assumed_noise
 
 MIN_CHEIRALITY = 0.5
+SHOWN_MOTIONS = 4096
+"""Motions from which the degenerate cases are recognised, and on which the scatter of the two-step methods is measured; longer recordings are sampled evenly."""
 
 
 def solve(
@@ -52,14 +55,16 @@ def solve(
     statistics = LineStatistics.from_problem(flat)
     if bool((statistics.count.sum(-1) < MIN_MOTIONS).any()):
         raise InsufficientDataError(where="axis lines", expected=f"at least {MIN_MOTIONS}", found=int(statistics.count.sum(-1).min()))
+    stride = max(1, flat.n_motions // SHOWN_MOTIONS)
+    part = flat.select_motions(slice(None, None, stride)) if stride > 1 else flat
     if method == "paper":
         R_each, t_each = solve_paper(statistics)
         R, t = average(R_each, t_each)
-        shares = torch.stack([influence(flat, R_each[:, c], t_each[:, c], (c,)) for c in range(flat.n_cameras)]).mean(0)
+        shares = torch.stack([influence(part, R_each[:, c], t_each[:, c], (c,)) for c in range(flat.n_cameras)]).mean(0)
     else:
         R, t, _ = find_candidates(statistics, settings.grid, settings.minima).best()
-        shares = influence(flat, R, t, tuple(range(flat.n_cameras)))
-    return _shaped(_two_step_solution(flat, R, t, empirical_covariance(shares), settings, method), problem.batch_shape)
+        shares = influence(part, R, t, tuple(range(flat.n_cameras)))
+    return _shaped(_two_step_solution(flat, R, t, empirical_covariance(shares) * (part.n_motions / flat.n_motions), settings, method), problem.batch_shape)
 
 
 def _check(problem: Problem) -> None:
@@ -68,14 +73,13 @@ def _check(problem: Problem) -> None:
         raise ObservationsError(where="arm_T_rcm", expected="finite poses", found="NaN or infinity")
     for name, R in (("arm_T_rcm", poses[..., :3, :3]), ("camera_left_T_camera_right", problem.camera_T_camera_right[..., :3, :3])):
         gap = float((R @ R.mT - torch.eye(3, dtype=R.dtype, device=R.device)).abs().max())
-        if not gap < 1e-5 or not bool((torch.linalg.det(R) > 0).all()):
+        handed = (torch.linalg.cross(R[..., 0], R[..., 1]) * R[..., 2]).sum(-1)  # LU of a million 3x3 takes a second
+        if not gap < 1e-5 or not bool((handed > 0).all()):
             raise ObservationsError(where=name, expected="rotations (orthonormal, determinant +1)", found=f"a deviation of {gap:.2g}")
 
 
 def _two_step_solution(flat: Problem, R: Tensor, t: Tensor, covariance: Tensor, settings: SolverSettings, method: str) -> Solution:
     """Solution of `paper` and `global`, which use the axis lines alone."""
-    from rmis_calib.solver.joint import cheirality
-
     axis_only = flat.only("axis")
     covariance = covariance + _unseen_depth(flat, R, t)
     packed = pack(axis_only, settings.noise)
@@ -135,8 +139,7 @@ def _joint_solution(fit: JointFit, settings: SolverSettings) -> Solution:
     status = torch.where((kept < 0.5) & (status == SolveStatus.CONVERGED), SolveStatus.INCONSISTENT, status)
     rows = packed.keep(used).rows_ok.sum(0)
     dof = (rows.sum(-1) - 6.0).clamp_min(1.0)
-    distance = torch.where(measured, fit.distance2, 0.0).sum(0) / measured.sum(0).clamp_min(1)
-    per_motion = packed.rows_ok.sum(0)
+    distance = (fit.distance2 / packed.rows_ok.sum(0).clamp_min(1)).sqrt()
     left = rigid_from_rotation_translation(state.stereo_R, state.stereo_t) if packed.cameras == 2 else None
     return Solution(
         method="joint",
@@ -147,7 +150,7 @@ def _joint_solution(fit: JointFit, settings: SolverSettings) -> Solution:
         cheirality=fit.cheirality,
         iterations=fit.steps,
         chi2_per_dof=fit.chi2 / dof,
-        distance=torch.where(seen, (distance * measured.sum(0) / per_motion.clamp_min(1)).sqrt(), torch.nan),
+        distance=torch.where(seen, distance, torch.nan),
         reason=reason,
         noise={name: getattr(fit.noise, name).sqrt() for name in ("line", "end", "head", "kinematics_mm", "kinematics_rad")},
         nuisances=_nuisances(fit, settings),
@@ -175,6 +178,8 @@ def _nuisances(fit: JointFit, settings: SolverSettings) -> dict[str, Nuisance]:
 def _sight(
     problem: Problem, R: Tensor, t: Tensor, C: Tensor, noise: NoiseModel, uses: tuple[bool, bool, bool], settings: SolverSettings
 ) -> Sight:
+    if problem.n_motions > SHOWN_MOTIONS:
+        problem = problem.select_motions(slice(None, None, problem.n_motions // SHOWN_MOTIONS))
     first = look(problem, R, t, C, settings.verdict, torch.zeros_like(t[:, 0], dtype=torch.int64))
     distance = torch.linalg.vector_norm(first.working_point_mm, dim=-1)
     flags = recognise(problem, noise.kinematics_mm.sqrt(), noise.kinematics_rad.sqrt(), uses, settings.noise, distance)
@@ -182,7 +187,13 @@ def _sight(
 
 
 def _residuals(packed: Packed, state: State) -> dict[str, Float[Tensor, "b c n"]]:
-    """Root mean square of each kind's residuals, per camera and motion."""
+    """Root mean square of each kind's residuals, per camera and motion; a long recording in parts."""
+    step = max(1, 8 * SHOWN_MOTIONS // packed.trials)
+    parts = [_residuals_of(packed.narrow(slice(None), slice(n, n + step)), state) for n in range(0, packed.motions, step)]
+    return {name: torch.cat([part[name] for part in parts], dim=-1) for name in parts[0]}
+
+
+def _residuals_of(packed: Packed, state: State) -> dict[str, Float[Tensor, "b c n"]]:
     r = residual_rows(packed, state)
     kinds, cameras = packed.row_kind, packed.row_camera
     out = {}

@@ -123,6 +123,17 @@ class Packed:
         names = [f.name for f in fields(self) if f.name not in ("camera_R", "camera_t") and getattr(self, f.name) is not None]
         return replace(self, **{name: getattr(self, name)[..., index] for name in names})
 
+    def gather(self, trial: Tensor, motion: Tensor) -> "Packed":
+        """Single motions (trial[i], motion[i]) as trials of one motion each."""
+        part = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name in ("camera_R", "camera_t"):
+                part[field.name] = value[..., trial]
+            elif value is not None:
+                part[field.name] = value[..., trial, motion][..., None]
+        return replace(self, **part)
+
     def repeat_trials(self, times: int) -> "Packed":
         """Every trial `times` times, neighbours together."""
         part = {}

@@ -21,6 +21,8 @@ from rmis_calib.solver.residuals import State
 from rmis_calib.solver.unknowns import Layout
 
 MIN_WEIGHT = 1e-6
+REJECTED = 0.5
+"""Weights are MIN_WEIGHT or 1 in the end; below this is rejected."""
 ANNEALING_STEPS = 24
 ANNEALING_FACTOR = 1.6
 FINAL_STEPS = 3
@@ -44,7 +46,7 @@ def truncated_cost(distance2: Float[Tensor, "c b n"], rows: Float[Tensor, "c b n
 
 def inlier_weight(distance2: Tensor, rows: Tensor, probability: float) -> Float[Tensor, "c b n"]:
     """1 where the distance is below the quantile, else MIN_WEIGHT."""
-    return torch.where(distance2 <= chi2_quantile(rows, probability), 1.0, MIN_WEIGHT)
+    return torch.where(distance2 <= chi2_quantile(rows, probability), 1.0, MIN_WEIGHT).to(distance2.dtype)
 
 
 def anneal(
@@ -72,3 +74,45 @@ def anneal(
         state = state.moved(layout.step(delta))
         distance2, rows = camera_distance2(packed, state, noise)
     return state, inlier_weight(distance2, rows, probability)
+
+
+def classify(
+    packed: Packed,
+    state: State,
+    noise: NoiseModel,
+    probability: float,
+    chunk: int,
+    distance2: Float[Tensor, "b n"] | None = None,
+) -> Float[Tensor, "c b n"]:
+    """`inlier_weight` of any number of motions, `chunk` at a time.
+
+    Args:
+        distance2: of each motion as a whole, where it is known: a camera's own distance is never larger, so only motions above the
+            least threshold are looked at.
+    """
+    if distance2 is not None:
+        rows = torch.stack([packed.rows_ok[_rows_of(packed, c)].sum(0) for c in range(packed.cameras)])
+        limit = chi2_quantile(rows.to(distance2.dtype), probability)
+        limit = torch.where(rows > 0, limit, torch.inf).amin(0)
+        trial, motion = torch.nonzero(~(distance2 <= limit) & (rows.sum(0) > 0), as_tuple=True)
+        weight = torch.ones_like(rows, dtype=distance2.dtype)
+        for k in range(0, len(trial), chunk):
+            b, n = trial[k : k + chunk], motion[k : k + chunk]
+            part = inlier_weight(*camera_distance2(packed.gather(b, n), state.take(b), noise.take(b)), probability)
+            weight[:, b, n] = part[:, :, 0]
+        return weight
+    step_n = min(packed.motions, chunk)
+    step_b = max(1, chunk // step_n)
+    weights = []
+    for b in range(0, packed.trials, step_b):
+        bs = slice(b, min(b + step_b, packed.trials))
+        parts = [
+            inlier_weight(*camera_distance2(packed.narrow(bs, slice(n, n + step_n)), state.take(bs), noise.take(bs)), probability)
+            for n in range(0, packed.motions, step_n)
+        ]
+        weights.append(torch.cat(parts, dim=2))
+    return torch.cat(weights, dim=1)
+
+
+def _rows_of(packed: Packed, camera: int) -> list[int]:
+    return [i for i, c in enumerate(packed.row_camera) if c == camera]
