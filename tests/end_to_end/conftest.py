@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 import data_synth
+from rmis_calib.cli import main
 
 
 @pytest.fixture(scope="session")
@@ -20,3 +21,11 @@ def rendered_pairs(tmp_path_factory) -> Path:
 def recording(rendered_pairs, tmp_path) -> Path:
     """A copy of it that a test may damage."""
     return Path(shutil.copytree(rendered_pairs, tmp_path / "recording"))
+
+
+@pytest.fixture(scope="session")
+def demo_output(tmp_path_factory):
+    """`rmis-calib demo` as `make demo` runs it: 60 motions, stereo, 640x480, 0.1 mm / 0.03 deg of kinematic noise."""
+    out = tmp_path_factory.mktemp("demo") / "demo_output"
+    assert main(["demo", "--out", str(out)]) == 0
+    return out

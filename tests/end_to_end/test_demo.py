@@ -12,14 +12,6 @@ from rmis_calib.cli import main
 from rmis_calib.pipeline.evaluation import CHI_3_SIGMA
 
 
-@pytest.fixture(scope="module")
-def demo_output(tmp_path_factory):
-    """`rmis-calib demo` as `make demo` runs it: 60 motions, stereo, 640x480, 0.1 mm / 0.03 deg of kinematic noise."""
-    out = tmp_path_factory.mktemp("demo") / "demo_output"
-    assert main(["demo", "--out", str(out)]) == 0
-    return out
-
-
 @pytest.mark.slow
 def test_demo_is_within_a_tenth_of_a_degree_and_its_own_sigmas(demo_output):
     result = rc.CalibrationResult.read(demo_output / "calibration" / "result.json")

@@ -1,4 +1,4 @@
-"""A real recording (dVRK, one fixed camera, 50 poses), with no hints: beside `reference.yaml`, itself good to 0.8 mm."""
+"""A real recording (dVRK, one fixed camera, 50 poses) without hints, beside `reference.yaml`, itself good to 0.8 mm."""
 
 import json
 
