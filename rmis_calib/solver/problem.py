@@ -124,8 +124,8 @@ class Problem:
         names = ("camera_T_camera_right", "valid", *(f"{k}_{s}" for k in ("axis", "contour", "end", "head") for s in ("xy", "sigma")))
         return replace(self, **{name: getattr(self, name).narrow(start, 0, count) for name in names})
 
-    def select_motions(self, index: Tensor) -> "Problem":
-        """The problem of the motions `index`, a tensor of positions or a mask, the same for every trial."""
+    def select_motions(self, index: Tensor | slice) -> "Problem":
+        """The problem of the motions `index` (positions, a mask or a slice), the same for every trial."""
         return self._map_motions(lambda x, dim: x[(slice(None),) * dim + (index,)])
 
     def flatten_batch(self) -> "Problem":
