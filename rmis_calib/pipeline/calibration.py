@@ -12,6 +12,7 @@ from rmis_calib.config import CalibrationConfig
 from rmis_calib.errors import InsufficientDataError
 from rmis_calib.io import Recording, ShaftObservations
 from rmis_calib.pipeline.detection import Progress, View, detect_recording, no_progress
+from rmis_calib.pipeline.device import require_device
 from rmis_calib.pipeline.estimation import (
     estimate,
     make_result,
@@ -119,6 +120,7 @@ def run_calibration(
     Source: paper, Algorithm 1, with detection before it and a check of the answer after it.
     """
     config = config or CalibrationConfig()
+    require_device(config.device)
     poses = motion_poses(recording, config.device)
     views = detect_recording(recording, config, progress)
     choices = tuple(first_choice(select_frames(view.detections, poses.frames)) for view in views)

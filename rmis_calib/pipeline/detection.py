@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from rmis_calib.config import CalibrationConfig
-from rmis_calib.errors import InputError
 from rmis_calib.geometry.cameras import Camera
 from rmis_calib.io import FrameSource, Recording, load_recording, open_source
+from rmis_calib.pipeline.device import require_device
 from rmis_calib.vision import FrameReason, ShaftDetections, ShaftDetector
 
 Progress = Callable[[str, int, int], None]
@@ -72,6 +72,7 @@ def detect(
         RecordingError: it is a recording that breaks its format.
     """
     config = config or CalibrationConfig()
+    require_device(config.device)
     if not isinstance(source, Recording) and (Path(source) / "recording.yaml").is_file():
         source = load_recording(source)
     if isinstance(source, Recording):
@@ -92,8 +93,6 @@ def detect_recording(recording: Recording, config: CalibrationConfig, progress: 
 def _detect_view(
     side: str, source: FrameSource, camera: Camera | None, config: CalibrationConfig, progress: Progress, stage: str
 ) -> View:
-    if config.device.startswith("cuda") and not torch.cuda.is_available():
-        raise InputError(where="device", expected="cpu: this machine has no CUDA device", found=config.device)
     moved = None if camera is None else camera.to(dtype=torch.float64, device=config.device)
     detector = ShaftDetector(config.detector, moved)
     parts, done = [], 0

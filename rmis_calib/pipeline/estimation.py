@@ -9,6 +9,7 @@ from rmis_calib.config import CalibrationConfig
 from rmis_calib.errors import CalibrationFailed
 from rmis_calib.geometry.rigid import RigidTransform
 from rmis_calib.io import ShaftObservations
+from rmis_calib.pipeline.device import require_device
 from rmis_calib.results import STATUS_SENTENCES, CalibrationResult, Motions, Status
 from rmis_calib.solver import Problem, Solution, SolveStatus
 from rmis_calib.solver import solve as solve_problem
@@ -31,6 +32,7 @@ def solve(
         InsufficientDataError: too few motions.
     """
     config = config or CalibrationConfig()
+    require_device(config.device)
     solution = estimate(observations, config)
     motions = Motions(*used_motions(solution))
     result = make_result(solution, motions, residuals_normalised(solution), config)
