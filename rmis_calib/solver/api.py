@@ -26,6 +26,8 @@ from rmis_calib.solver.unknowns import TRANSLATION_SIGMA_MM, UNITS, Nominal, ini
 from rmis_calib.solver.variance import assumed_noise
 
 MIN_CHEIRALITY = 0.5
+MAX_CHI2_PER_DOF = 3.0
+"""Past this the model is wrong (swapped cameras, another rig), and no larger noise level makes it right."""
 SHOWN_MOTIONS = 4096
 """Motions from which the degenerate cases are recognised, and on which the scatter of the two-step methods is measured; longer recordings are sampled evenly."""
 
@@ -137,8 +139,10 @@ def _joint_solution(fit: JointFit, settings: SolverSettings) -> Solution:
     kept = (used & measured).sum((0, 2)) / measured.sum((0, 2)).clamp_min(1)
     status = torch.where((fit.cheirality < MIN_CHEIRALITY) & (fit.status == SolveStatus.CONVERGED), SolveStatus.BEHIND_CAMERA, fit.status)
     status = torch.where((kept < 0.5) & (status == SolveStatus.CONVERGED), SolveStatus.INCONSISTENT, status)
-    rows = packed.keep(used).rows_ok.sum(0)
-    dof = (rows.sum(-1) - 6.0).clamp_min(1.0)
+    dof = (packed.keep(used).rows_ok.sum((0, 2)) - 6.0).clamp_min(1.0)
+    excess = fit.chi2 / dof
+    status = torch.where((excess > MAX_CHI2_PER_DOF) & (status == SolveStatus.CONVERGED), SolveStatus.MISFIT, status)
+    C = C * excess.clamp_min(1.0)[:, None, None]  # noise levels that are too small would make sigma too small (Birge 1932)
     distance = (fit.distance2 / packed.rows_ok.sum(0).clamp_min(1)).sqrt()
     left = rigid_from_rotation_translation(state.stereo_R, state.stereo_t) if packed.cameras == 2 else None
     return Solution(
@@ -149,7 +153,7 @@ def _joint_solution(fit: JointFit, settings: SolverSettings) -> Solution:
         status=status,
         cheirality=fit.cheirality,
         iterations=fit.steps,
-        chi2_per_dof=fit.chi2 / dof,
+        chi2_per_dof=excess,
         distance=torch.where(seen, distance, torch.nan),
         reason=reason,
         noise={name: getattr(fit.noise, name).sqrt() for name in ("line", "end", "head", "kinematics_mm", "kinematics_rad")},

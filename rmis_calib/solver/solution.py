@@ -18,6 +18,7 @@ class SolveStatus(IntEnum):
     SINGULAR = 4
     BEHIND_CAMERA = 5
     INCONSISTENT = 6
+    MISFIT = 7
 
     @property
     def sentence(self) -> str:
@@ -31,6 +32,7 @@ _SENTENCES = {
     SolveStatus.NON_FINITE: "a residual became infinite or undefined",
     SolveStatus.SINGULAR: "the measurements leave a direction of the unknown entirely free",
     SolveStatus.BEHIND_CAMERA: "the best fit puts the shaft behind the camera or its tip on the wrong side",
+    SolveStatus.MISFIT: "the residuals are larger than the noise levels explain",
     SolveStatus.INCONSISTENT: "fewer than half of the measurements agree with any single transform",
 }
 
