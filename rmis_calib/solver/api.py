@@ -13,19 +13,20 @@ from rmis_calib.solver.competition import cheirality
 from rmis_calib.solver.initialise import COLLAPSED_MM, collapsed, find_candidates
 from rmis_calib.solver.joint import JointFit, solve_joint
 from rmis_calib.solver.measurements import END, HEAD, LINE, Packed, pack
-from rmis_calib.solver.normal import NoiseModel
+from rmis_calib.solver.normal import NoiseModel, accumulate
 from rmis_calib.solver.observability import Degeneracy, Sight, look, recognise
 from rmis_calib.solver.paper import average, empirical_covariance, influence, solve_paper
 from rmis_calib.solver.problem import MIN_MOTIONS, Problem
 from rmis_calib.solver.relinearise import Kinematics, solve_relinearised
 from rmis_calib.solver.residuals import State, residual_rows
-from rmis_calib.solver.settings import SolverSettings
+from rmis_calib.solver.settings import SolverSettings, UnknownSettings
 from rmis_calib.solver.solution import MotionReason, Nuisance, Solution, SolveStatus
 from rmis_calib.solver.statistics import LineStatistics
-from rmis_calib.solver.unknowns import TRANSLATION_SIGMA_MM, UNITS, Nominal, initial_state
+from rmis_calib.solver.unknowns import TRANSLATION_SIGMA_MM, UNITS, Nominal, initial_state, make_layout
 from rmis_calib.solver.variance import assumed_noise
 
 MIN_CHEIRALITY = 0.5
+CHECKED_MOTIONS = 256
 MAX_CHI2_PER_DOF = 3.0
 """Past this the model is wrong (swapped cameras, another rig), and no larger noise level makes it right."""
 SHOWN_MOTIONS = 4096
@@ -91,7 +92,8 @@ def _two_step_solution(flat: Problem, R: Tensor, t: Tensor, covariance: Tensor, 
     status = torch.where(front < MIN_CHEIRALITY, SolveStatus.BEHIND_CAMERA, SolveStatus.CONVERGED)
     status = torch.where(torch.isfinite(covariance).all(-1).all(-1) & torch.isfinite(t).all(-1), status, SolveStatus.NON_FINITE)
     seen = packed.line_ok.any(0).any(0)
-    nan = torch.full_like(front, torch.nan)
+    excess = _chi2_per_dof(axis_only, state, noise, settings)
+    status = torch.where((excess > MAX_CHI2_PER_DOF) & (status == SolveStatus.CONVERGED), SolveStatus.MISFIT, status)
     sight = _sight(axis_only, R, t, covariance, noise, (False, False, False), settings)
     static = (sight.degeneracy & Degeneracy.STATIC_LAPAROSCOPE) > 0
     # A two-step estimate from a laparoscope that stands still is biased by more than its scatter shows (DESIGN.md, section 3).
@@ -104,7 +106,7 @@ def _two_step_solution(flat: Problem, R: Tensor, t: Tensor, covariance: Tensor, 
         status=status,
         cheirality=front,
         iterations=torch.zeros_like(status),
-        chi2_per_dof=nan,
+        chi2_per_dof=excess,
         distance=torch.full_like(seen, torch.nan, dtype=t.dtype),
         reason=torch.where(seen, MotionReason.USED, MotionReason.NOT_MEASURED),
         noise={},
@@ -113,6 +115,16 @@ def _two_step_solution(flat: Problem, R: Tensor, t: Tensor, covariance: Tensor, 
         sight=sight,
         **_residuals(packed, state),
     )
+
+
+def _chi2_per_dof(problem: Problem, state: State, noise: NoiseModel, settings: SolverSettings) -> Float[Tensor, " b"]:
+    """Weighted squared residuals over degrees of freedom, on a few hundred motions: a fit in the wrong basin shows here where the cheirality does not."""
+    part = problem.select_motions(slice(None, None, max(1, problem.n_motions // CHECKED_MOTIONS)))
+    packed = pack(part, settings.noise)
+    layout = make_layout(Nominal.of(part), packed, state, UnknownSettings(stereo=False), settings.noise)
+    normal = accumulate(packed, state, layout, noise, settings.chunk)
+    prior = layout.prior(state)
+    return (normal.chi2 - (prior[0].square() * prior[1]).sum(-1)) / (normal.rows - 6.0).clamp_min(1.0)
 
 
 def _unseen_depth(flat: Problem, R: Tensor, t: Tensor) -> Float[Tensor, "b 6 6"]:

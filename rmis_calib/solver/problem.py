@@ -137,6 +137,10 @@ class Problem:
 
         return _map_tensors(self, lambda x, _: flat(x))
 
+    def take_trials(self, index: Tensor | int) -> "Problem":
+        """The problem of some trials of the only batch axis, in this order; with a number, that trial without the axis."""
+        return _map_tensors(self, lambda x, _: x[index])
+
     def _map_motions(self, function: Any) -> "Problem":
         k = len(self.batch_shape)
         after_camera = {"axis_xy", "axis_sigma", "contour_xy", "contour_sigma", "end_xy", "end_sigma", "head_xy", "head_sigma", "valid"}
