@@ -50,7 +50,9 @@ class FullPicture:
         """
         height, width = self.images.shape[-2:]
         raw = self.lens.to_raw(ideal)
-        u, v = raw[..., 0].clamp(0, width - 1.001), raw[..., 1].clamp(0, height - 1.001)
+        # A strip that no contour supports may have no place: it reads the corner and is not inside.
+        safe = torch.nan_to_num(raw)
+        u, v = safe[..., 0].clamp(0, width - 1.001), safe[..., 1].clamp(0, height - 1.001)
         column, row = u.to(torch.int64), v.to(torch.int64)
         du, dv = (u - column)[..., None], (v - row)[..., None]
         frame = self.frame.reshape(*self.frame.shape, *[1] * (u.ndim - 2))

@@ -12,7 +12,7 @@ from rmis_calib.vision.strips import SmallPicture, Strips
 
 _STATIONS, _GLANCES = 96, 32
 _INNER, _RIM = 7, 4
-MAX_BRIGHTER = 0.55
+MAX_BRIGHTER = 0.5
 """Log brightness by which the inside of a shaft may exceed its surroundings. Slate-grey shafts on dark liver reach 0.3;
 white and bare metal instruments, less tinted than tissue as well, start at 0.6."""
 # A wrist of bare metal lies about half-way between shaft and tissue (0.5 to 0.7 in both da Vinci and grasper pictures);
