@@ -106,8 +106,8 @@ def peaks(votes: Float[Tensor, "b angles rhos"], count: int) -> HoughLines:
     sides = pad(around, (1, 1))
     rows = sides[:, :, :-2] + sides[:, :, 1:-1] + sides[:, :, 2:]
     smooth = (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:])[:, 2:-2] * (1 / 9)
-    wide = torch.cat([smooth[:, -3:], smooth, smooth[:, :3]], 1)
-    tops = pad(_window_max(wide, 3, 1), (2, 2))
+    wide = torch.cat([smooth[:, -2:], smooth, smooth[:, :2]], 1)
+    tops = pad(_window_max(wide, 2, 1), (2, 2))
     score = torch.where(smooth >= _window_max(tops, 2, 2), smooth, 0.0)
     best = score.reshape(frames, -1).topk(count, dim=1)
     angle, rho = best.indices // rhos, best.indices % rhos

@@ -3,7 +3,7 @@
     python tests/benchmarks/bench_vision_real_frames.py [--overlays DIR]
 
 Labels (tests/vision/labels.csv): two points on either contour of each shaft that shows at least one width of both.
-Segments were picked by eye on the pictures (most of them among proposals of a permissive detector), each then snapped to
+Segments were picked by eye on the pictures (most among the proposals of a permissive detector), each then snapped to
 the strongest colour gradient by code of its own and checked at three to four times magnification; what did not convince
 was dropped. `soft` marks contours out of focus, good to about two pixels; the others are good to half a pixel. A
 detection that no label claims counts under `others`: look at the overlay to see what it is.
