@@ -4,12 +4,13 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from rmis_calib.errors import InsufficientDataError, ObservationsError
+from rmis_calib.errors import InputError, InsufficientDataError, ObservationsError
 from rmis_calib.geometry.rigid import rigid_from_rotation_translation
 from rmis_calib.solver.competition import cheirality
+from rmis_calib.solver.design import motion_information, thin
 from rmis_calib.solver.initialise import COLLAPSED_MM, collapsed, find_candidates
 from rmis_calib.solver.joint import JointFit, solve_joint
 from rmis_calib.solver.measurements import END, HEAD, LINE, Packed, pack
@@ -53,8 +54,15 @@ def solve(
     flat = problem.flatten_batch()
     _check(flat)
     if method == "joint":
+        index, kept = None, 1.0
+        if settings.thin_to is not None and settings.thin_to < flat.n_motions:
+            index, kept = _informative(flat, settings, settings.thin_to)
+            flat = flat.select_motions(index)
         fit = solve_joint(flat, settings) if kinematics is None else solve_relinearised(flat, settings, kinematics)
-        return _shaped(_joint_solution(fit, settings), problem.batch_shape)
+        solution = _joint_solution(fit, settings)
+        if index is not None:
+            solution = replace(_spread(solution, index, problem.n_motions), information_kept=kept)
+        return _shaped(solution, problem.batch_shape)
     statistics = LineStatistics.from_problem(flat)
     if bool((statistics.count.sum(-1) < MIN_MOTIONS).any()):
         raise InsufficientDataError(where="axis lines", expected=f"at least {MIN_MOTIONS}", found=int(statistics.count.sum(-1).min()))
@@ -68,6 +76,38 @@ def solve(
         R, t, _ = find_candidates(statistics, settings.grid, settings.minima).best()
         shares = influence(part, R, t, tuple(range(flat.n_cameras)))
     return _shaped(_two_step_solution(flat, R, t, empirical_covariance(shares) * (part.n_motions / flat.n_motions), settings, method), problem.batch_shape)
+
+
+def _informative(flat: Problem, settings: SolverSettings, count: int) -> tuple[Int[Tensor, " k"], float]:
+    """The motions that `thin_to` keeps, by their information at the estimate of an even sample.
+
+    Raises:
+        InputError: a batch of trials, whose motions cannot be chosen together.
+    """
+    if flat.n_trials != 1:
+        raise InputError(where="thin_to", expected="a single trial", found=f"{flat.n_trials} trials")
+    first = solve_joint(flat.select_motions(slice(None, None, max(1, flat.n_motions // max(count, CHECKED_MOTIONS)))), settings)
+    packed = pack(flat, settings.noise)
+    information = torch.cat(
+        [
+            motion_information(packed.narrow(slice(None), slice(n, n + settings.chunk)), first.state, first.layout, first.noise)[0]
+            for n in range(0, flat.n_motions, settings.chunk)
+        ]
+    )
+    return thin(information, torch.diag(first.layout.sigma[0].square().reciprocal()), count)
+
+
+def _spread(solution: Solution, index: Int[Tensor, " k"], n: int) -> Solution:
+    """The solution of some motions with its per-motion values at their places among all `n`; the others are marked as thinned."""
+
+    def spread(value: Tensor, empty: float | int) -> Tensor:
+        out = torch.full((*value.shape[:-1], n), empty, dtype=value.dtype, device=value.device)
+        out[..., index] = value
+        return out
+
+    names = ("residual_lines", "residual_ends", "residual_heads", "distance")
+    values = {name: spread(getattr(solution, name), torch.nan) for name in names}
+    return replace(solution, reason=spread(solution.reason, int(MotionReason.THINNED)), **values)
 
 
 def _check(problem: Problem) -> None:
@@ -187,7 +227,7 @@ def _nuisances(fit: JointFit, settings: SolverSettings) -> dict[str, Nuisance]:
             continue
         value = fit.state.radius[:, None] if name == "radius" else deviation[:, part]
         held = sigma[:, part] > settings.unknowns.held_ratio * fit.layout.sigma[:, part]
-        out[name] = Nuisance(value=value, sigma=sigma[:, part], unit=UNITS[name], held=held)
+        out[name] = Nuisance(value=value, sigma=sigma[:, part], unit=UNITS[name], held=held, pull=deviation[:, part] / fit.layout.sigma[:, part])
     return out
 
 
@@ -233,7 +273,7 @@ def _shaped(solution: Solution, batch: torch.Size) -> Solution:
         if isinstance(value, dict):
             return {key: shaped(item) for key, item in value.items()}
         if isinstance(value, Nuisance):
-            return Nuisance(shaped(value.value), shaped(value.sigma), value.unit, shaped(value.held))
+            return Nuisance(shaped(value.value), shaped(value.sigma), value.unit, shaped(value.held), shaped(value.pull))
         return value
 
     names = [name for name in vars(solution) if name not in ("sight", "history")]

@@ -58,7 +58,7 @@ def working_point(problem: Problem, R: Tensor, t: Tensor, settings: VerdictSetti
     return (R @ arm_p.mean(-2)[..., None])[..., 0] + t
 
 
-def carried(t: Tensor, point: Tensor, lever: float) -> Float[Tensor, "b 6 6"]:
+def carried(t: Float[Tensor, "*b 3"], point: Float[Tensor, "*b 3"], lever: float) -> Float[Tensor, "*b 6 6"]:
     """Matrix from (dphi, dt) to (lever * dphi, displacement of the point)."""
     eye = torch.eye(3, dtype=t.dtype, device=t.device).expand(*t.shape[:-1], 3, 3)
     top = torch.cat((lever * eye, torch.zeros_like(eye)), dim=-1)

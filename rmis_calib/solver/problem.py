@@ -255,6 +255,8 @@ class _Reader:
         value = self.arrays.get(f"valid_{side}")
         if value is None:
             return torch.ones((*self.batch, self.n), dtype=torch.bool, device=self.device)
+        if isinstance(value, np.ndarray):
+            value = value.astype(bool)  # a copy: torch cannot share read-only memory
         return torch.as_tensor(value, dtype=torch.bool, device=self.device).expand(*self.batch, self.n)
 
 

@@ -10,8 +10,12 @@ A weight enters as covariance / w, so a dropped camera costs nothing and distort
 the good measurements.
 """
 
+from functools import lru_cache
+
+import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.special import chdtri
 from torch import Tensor
 
 from rmis_calib.solver.measurements import Packed
@@ -29,13 +33,15 @@ FINAL_STEPS = 3
 """Hard reclassifications after annealing, each followed by a step."""
 
 
+@lru_cache(maxsize=32)
+def _quantiles(most_rows: int, probability: float) -> Tensor:
+    return torch.as_tensor(chdtri(np.maximum(np.arange(most_rows + 1), 1), probability))
+
+
 def chi2_quantile(rows: Float[Tensor, "..."], probability: float) -> Float[Tensor, "..."]:
-    """Quantile of chi^2 at 1 - probability by Wilson and Hilferty's cube; within 1 per cent for 1 to 20 rows and 1e-6 <= probability <= 0.5."""
-    normal = torch.distributions.Normal(rows.new_zeros(()), rows.new_ones(()))
-    z = normal.icdf(rows.new_tensor(1.0 - probability))
-    k = rows.clamp_min(1.0)
-    spread = 2.0 / (9.0 * k)
-    return k * (1.0 - spread + z * spread.sqrt()) ** 3
+    """Value that chi^2 with as many degrees of freedom as rows exceeds with this probability; that of one row for none."""
+    table = _quantiles(int(rows.max()) if rows.numel() else 1, probability).to(rows)
+    return table[rows.long()]
 
 
 def truncated_cost(distance2: Float[Tensor, "c b n"], rows: Float[Tensor, "c b n"], probability: float) -> Float[Tensor, " b"]:

@@ -70,12 +70,14 @@ _REASONS = {
 
 @dataclass(frozen=True)
 class Nuisance:
-    """An unknown that was estimated beside the transform: value, 1 sigma, unit, and whether the data could tell it at all."""
+    """An unknown that was estimated beside the transform: value, 1 sigma, unit, whether the data could not tell it (held),
+    and how many sigmas of its prior it was pulled from its nominal value."""
 
     value: Float[Tensor, "*batch k"]
     sigma: Float[Tensor, "*batch k"]
     unit: str
     held: Bool[Tensor, "*batch k"]
+    pull: Float[Tensor, "*batch k"]
 
 
 @dataclass(frozen=True)
