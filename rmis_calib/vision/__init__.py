@@ -6,9 +6,12 @@ __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
         "DetectorSettings": ".settings",
+        "FolderMasks": ".masks",
         "FrameReason": ".reasons",
         "ShaftDetections": ".shaft_lines",
         "ShaftDetector": ".shaft_lines",
         "draw_detections": ".overlay",
+        "draw_stages": ".stages",
+        "load_segmenter": ".masks",
     },
 )

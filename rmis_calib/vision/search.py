@@ -29,10 +29,14 @@ class Stages:
     lines: hough.HoughLines
     evidence: scoring.Evidence
     scores: Float[Tensor, "b k"]
+    factor: int
+    """Full-resolution pixels a small one."""
+    origin: tuple[float, float]
+    """Ideal pixel of the first small pixel."""
 
 
 def search(
-    images: Tensor, canvas: Canvas, settings: DetectorSettings, count: int
+    images: Tensor, canvas: Canvas, settings: DetectorSettings, count: int, masks: Tensor | None = None
 ) -> tuple[trace.Trace, Float[Tensor, "b c"], Stages]:
     """The best `count` strips of each frame with their contours traced, their scores, and the stages that led there.
 
@@ -41,6 +45,7 @@ def search(
         canvas: the small picture's place.
         settings: limits of width, contrast, convergence.
         count: strips wanted a frame.
+        masks: (b, H, W), 1 on shafts, which replace the colour stage.
     """
     small = shrink(images, canvas.factor)
     field, within = shaft_mask.field_of_view(small, settings.black_level, _RIM_PX)
@@ -49,7 +54,11 @@ def search(
     rgb, seen, well_inside = stack[:, :3], stack[:, 3] > 0.5, stack[:, 4] > 0.99
     if canvas.covered is not None:
         seen, well_inside = seen & canvas.covered, well_inside & canvas.covered
-    unlike, tone = shaft_mask.unlikeness(rgb, seen)
+    if masks is None:
+        unlike, tone = shaft_mask.unlikeness(rgb, seen)
+    else:
+        inside = canvas.lay_out(shrink(masks[:, None].to(torch.float32), canvas.factor))
+        unlike, tone = shaft_mask.smooth(1 - inside[:, 0]), torch.zeros_like(inside[:, 0])
     ridge, edges = _edges(unlike, well_inside)
     votes = hough.vote(edges, images.shape[0], canvas.half_diagonal_px / canvas.factor + 2)
     lines = hough.refine(edges, hough.peaks(votes, _LINES))
@@ -62,7 +71,7 @@ def search(
     traced = trace.trace(picture, evidence.strips.pick(index), settings)
     # Once more around lines through what was traced: the pair of Hough lines may have followed a short stretch only.
     traced = trace.trace(picture, trace.straighten(traced), settings)
-    return traced, best, Stages(rgb, seen, unlike, ridge, votes, lines, evidence, scores)
+    return traced, best, Stages(rgb, seen, unlike, ridge, votes, lines, evidence, scores, canvas.factor, canvas.origin)
 
 
 def _edges(

@@ -1,6 +1,7 @@
 """The shaft detector: pictures in, contour lines, axis and shaft end out, with uncertainty and a reason per frame."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -13,6 +14,7 @@ from rmis_calib.vision import edges, ends
 from rmis_calib.vision.canvas import Canvas, plan_canvas
 from rmis_calib.vision.lens import Lens
 from rmis_calib.vision.linefit import LineFit, fit_lines
+from rmis_calib.vision.masks import checked_masks
 from rmis_calib.vision.reasons import FrameReason
 from rmis_calib.vision.runs import masked_median, smooth_over
 from rmis_calib.vision.sampling import FullPicture
@@ -64,29 +66,39 @@ class ShaftDetections:
 class ShaftDetector:
     """Finds instrument shafts in batches of pictures, on the device that the pictures are on."""
 
-    def __init__(self, settings: DetectorSettings | None = None, camera: Camera | None = None) -> None:
+    def __init__(
+        self,
+        settings: DetectorSettings | None = None,
+        camera: Camera | None = None,
+        segment: Callable[[Tensor], Tensor] | None = None,
+    ) -> None:
         """Keep the limits and the camera.
 
         Args:
             settings: defaults serve every picture that the project was tested on.
             camera: None leaves everything in pixels, with no undistortion.
+            segment: maps pictures (b, 3, h, w) in [0, 1] to masks (b, h, w) or (b, 1, h, w), above 0.5 on shafts, and
+                replaces the colour stage. None: the colour stage.
         """
         self.settings = settings or DetectorSettings()
         self.lens = Lens(camera)
+        self.segment = segment
         self._canvases: dict[tuple[tuple[int, int], torch.device], Canvas] = {}
 
-    def detect(self, images: Tensor) -> ShaftDetections:
+    def detect(self, images: Tensor, masks: Tensor | None = None) -> ShaftDetections:
         """Shafts of each picture.
 
         Args:
             images: (b, 3, h, w) RGB, uint8, or floating point in [0, 1].
+            masks: (b, h, w), above 0.5 on shafts; take the place of the colour stage and of `segment`.
 
         Raises:
-            ShapeError: another shape or dtype, a picture smaller than 64 px, or not of the camera's size.
+            ShapeError: another shape or dtype, a picture smaller than 64 px, or not of the camera's size; or masks that
+                do not fit the pictures.
         """
-        return self.explain(images)[0]
+        return self.explain(images, masks)[0]
 
-    def explain(self, images: Tensor) -> tuple[ShaftDetections, Stages]:
+    def explain(self, images: Tensor, masks: Tensor | None = None) -> tuple[ShaftDetections, Stages]:
         """Shafts, and what each stage of the coarse search saw. Arguments and errors as in `detect`."""
         self._check(images)
         with torch.no_grad():
@@ -94,7 +106,13 @@ class ShaftDetector:
             if images.dtype != torch.uint8:
                 broken = ~torch.isfinite(images).flatten(1).all(1)
                 images = torch.nan_to_num(images.to(torch.float32), nan=0.0, posinf=0.0, neginf=0.0)
-            trace, scores, stages = search(images, self._canvas(images), self.settings, self.settings.max_shafts)
+            if masks is None and self.segment is not None:
+                scale = 1.0 / 255.0 if images.dtype == torch.uint8 else 1.0
+                masks = self.segment(images.to(torch.float32) * scale)
+            if masks is not None:
+                masks = checked_masks(masks, images)
+            found = search(images, self._canvas(images), self.settings, self.settings.max_shafts, masks)
+            trace, scores, stages = found
             return self._measure(images.contiguous(), trace, scores, stages, broken), stages
 
     def _canvas(self, images: Tensor) -> Canvas:

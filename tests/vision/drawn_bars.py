@@ -1,4 +1,4 @@
-"""Pictures drawn by the tests themselves: exact bars seen through a Gaussian, so that no code under test makes the truth."""
+"""Pictures drawn by the tests themselves: exact bars seen through a Gaussian, their truth from no code under test."""
 
 from dataclasses import dataclass
 
@@ -39,7 +39,7 @@ def draw_bar(
     wrist: tuple[float, float, float] | None = None,
     seed: int = 0,
 ) -> Bar:
-    """A bar that enters from the border opposite to `angle_deg` (x right, y down) and ends `end_px` beyond the middle."""
+    """A bar along `angle_deg` (x right, y down), from the border behind to `end_px` beyond the middle."""
     height, width = size
     u, v = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
     angle = np.deg2rad(angle_deg)

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from drawn_bars import Bar, draw_bar, tissue
 
 from rmis_calib.errors import ShapeError
 from rmis_calib.geometry import Camera, axis_plane, contour_planes, plane_normal_from_points
 from rmis_calib.vision import DetectorSettings, FrameReason, ShaftDetections, ShaftDetector
-from drawn_bars import Bar, draw_bar, tissue
 
 
 def contour_errors_px(found: ShaftDetections, bar: Bar, frame: int = 0) -> np.ndarray:
