@@ -36,6 +36,9 @@ class CalibrationConfig:
     edge_bias_px: float = 0.02
     """Error of a contour point that every picture of a camera shares (lens model, edge detector), 1 sigma, px. It does
     not average out: it enters the covariance, not the estimate. 0.02 px was measured on rendered pictures."""
+    clock_search_s: float = 3.0
+    """With `solver.unknowns.clock`: clock offsets are searched this far to either side of the recording's own. Public
+    recordings are off by up to 2.4 s."""
     min_motions: int = 6
     """Fewest motions with a usable shaft."""
     detector: DetectorSettings = field(default_factory=DetectorSettings)
@@ -58,7 +61,7 @@ class CalibrationConfig:
             raise ValueError("must be at least 1")
         return value
 
-    @field_validator("model_sigma_px", "edge_bias_px")
+    @field_validator("model_sigma_px", "edge_bias_px", "clock_search_s")
     @classmethod
     def _not_negative(cls, value: float) -> float:
         if value < 0:

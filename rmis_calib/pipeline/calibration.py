@@ -15,6 +15,7 @@ from rmis_calib.pipeline.detection import Progress, View, detect_recording, no_p
 from rmis_calib.pipeline.device import require_device
 from rmis_calib.pipeline.estimation import (
     estimate,
+    estimate_with_kinematics,
     make_result,
     raise_unless_trustworthy,
     residual_arrays,
@@ -22,6 +23,7 @@ from rmis_calib.pipeline.estimation import (
     used_motions,
 )
 from rmis_calib.pipeline.evaluation import head_point_errors, summarise_head_points
+from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
 from rmis_calib.pipeline.observing import (
     Choice,
     assemble,
@@ -38,6 +40,8 @@ from rmis_calib.solver import Solution
 
 JOINTS_UNKNOWN = "the joint log does not cover this time"
 TOO_FEW = "usable, but there are too few"
+CONTINUOUS_LOG_S = 0.2
+"""A log sampled more slowly is a list of poses, in which there is no velocity and so no clock to estimate."""
 CHOICE_ROUNDS = 3
 """Solves at most: a choice of candidates that has not settled by then alternates between equals."""
 
@@ -148,21 +152,47 @@ def _solve_choice(
         return CalibrationRun(_insufficient(config, motions), recording, views, poses, choices, None, None)
     progress("solving", 0, 1)
     observations = assemble(recording, poses, views, choices, config)
+    unknowns = _kinematic_unknowns(recording, poses, config)
     try:
-        solution = estimate(observations, config)
+        if unknowns is None:
+            solution = estimate(observations, config)
+        else:
+            solution = estimate_with_kinematics(observations, config, unknowns)
+            poses = _at_estimate(unknowns, poses, solution)
+            observations = assemble(recording, poses, views, choices, config)
     except InsufficientDataError as error:
         motions = _motions(recording, views, poses, choices, None)
         result = _insufficient(config, motions, str(error))
         return CalibrationRun(result, recording, views, poses, choices, observations, None)
     progress("solving", 1, 1)
     motions = _motions(recording, views, poses, choices, solution)
-    result = make_result(solution, motions, _residuals_px(recording, poses, solution), config)
+    columns = () if unknowns is None else unknowns.columns
+    result = make_result(solution, motions, _residuals_px(recording, poses, solution), config, columns)
     errors = head_point_errors(result, recording, poses)
     residuals = result.residuals | {
         f"head_{side}": residual_record(distance, "px") for side, distance in (errors or {}).items()
     }
     result = replace(result, residuals=residuals, head_point_error_px=summarise_head_points(errors))
     return CalibrationRun(result, recording, views, poses, choices, observations, solution)
+
+
+def _kinematic_unknowns(
+    recording: Recording, poses: MotionPoses, config: CalibrationConfig
+) -> KinematicUnknowns | None:
+    """The kinematics as a function of joint and clock offsets, where these are asked for."""
+    asked = config.solver.unknowns
+    intervals_s = np.diff(recording.joints.timestamps_s)
+    continuous = len(intervals_s) > 0 and float(np.median(intervals_s)) <= CONTINUOUS_LOG_S
+    if config.solver.method != "joint" or not (asked.joint_offsets or (asked.clock and continuous)):
+        return None
+    return KinematicUnknowns(recording, poses.frames, config.device)
+
+
+def _at_estimate(unknowns: KinematicUnknowns, poses: MotionPoses, solution: Solution) -> MotionPoses:
+    """The poses at the estimated joint and clock offsets."""
+    found = {name: solution.nuisances[name].value for name in ("joint_offset", "clock") if name in solution.nuisances}
+    joint_offset = found.get("joint_offset", poses.rcm_s_end_mm.new_zeros(len(unknowns.columns)))
+    return unknowns.motion_poses(poses.frames, joint_offset, float(found.get("clock", torch.zeros(1))))
 
 
 def _choose_again(run: CalibrationRun) -> tuple[Choice, ...] | None:

@@ -10,12 +10,23 @@ from rmis_calib.errors import CalibrationFailed
 from rmis_calib.geometry.rigid import RigidTransform
 from rmis_calib.io import ShaftObservations
 from rmis_calib.pipeline.device import require_device
+from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
 from rmis_calib.results import STATUS_SENTENCES, CalibrationResult, Motions, Status
 from rmis_calib.solver import Problem, Solution, SolveStatus
 from rmis_calib.solver import solve as solve_problem
+from rmis_calib.solver.relinearise import scan_clock
 from rmis_calib.solver.solution import MotionReason, Observability
 
-MEASUREMENT_KEYS = {"axis": "axis", "contours": "contour", "ends": "end", "heads": "head"}
+COARSE_CLOCK_STEP_S, CLOCK_STEP_S = 0.1, 0.02
+"""Spacing of the clock offsets that are tried, first everywhere, then near the best: surgical motion hardly turns within
+0.1 s, and motion within 0.02 s stays inside one linearisation."""
+CLEARLY_BETTER = 0.5
+"""Part of the disagreement at the recording's own clock below which another clock offset is believed. A camera that
+looks only when the arms rest sees no clock, and its scan has a flat minimum."""
+HELD = 1e-3
+"""Part of its prior to which an offset is held that the data cannot tell from the transform."""
+TOO_FAR_SIGMA = 4.0
+"""An unknown estimated this many prior sigmas from its nominal value says that the model does not fit the data."""
 
 
 def solve(
@@ -43,8 +54,55 @@ def solve(
 
 def estimate(observations: ShaftObservations, config: CalibrationConfig) -> Solution:
     """Run the configured solver on the configured kinds of measurement."""
-    problem = Problem.from_observations(observations, device=config.device)
-    return solve_problem(problem.only(*config.measurements), config.solver)
+    return solve_problem(_problem(observations, config), config.solver)
+
+
+def estimate_with_kinematics(
+    observations: ShaftObservations, config: CalibrationConfig, unknowns: KinematicUnknowns
+) -> Solution:
+    """The same with constant joint offsets, and the clock offset, among the unknowns of `joint`.
+
+    An offset that the data cannot tell from the transform (its sigma stays at its prior) is held at zero in a second
+    solve: its prior would else be counted as uncertainty of a transform that absorbs it anyway.
+    """
+    base = _problem(observations, config).flatten_batch()
+    asked = config.solver.unknowns
+    sigma = unknowns.prior_sigma(asked)
+    if not asked.joint_offsets:
+        sigma = sigma * 0.0
+    clock_s = sigma.new_zeros(1)
+    if asked.clock:
+        clock_s = clock_s + _clock_start(base, unknowns, config.clock_search_s, sigma)
+
+    def solve_with(sigma: torch.Tensor) -> Solution:
+        def kinematics(joint_offset: torch.Tensor, clock_s: torch.Tensor) -> Problem:
+            return unknowns.linearised(base, joint_offset, clock_s, sigma)
+
+        start = kinematics(torch.zeros_like(sigma)[None], clock_s)
+        return solve_problem(start.take_trials(0), config.solver, kinematics=kinematics)
+
+    solution = solve_with(sigma)
+    if "joint_offset" in solution.nuisances and bool(solution.nuisances["joint_offset"].held.any()):
+        solution = solve_with(torch.where(solution.nuisances["joint_offset"].held, HELD * sigma, sigma))
+    return solution
+
+
+def _clock_start(base: Problem, unknowns: KinematicUnknowns, reach_s: float, like: torch.Tensor) -> float:
+    """Clock offset at which axis lines and joints agree best; 0 unless another one is clearly better."""
+
+    def scan(centre_s: float, half_s: float, step_s: float) -> tuple[float, torch.Tensor]:
+        count = 2 * round(half_s / step_s) + 1
+        offsets = centre_s + torch.linspace(-half_s, half_s, count).to(like)
+        return scan_clock(lambda joint, clock: unknowns.at(base, joint, clock), len(like), offsets)
+
+    coarse_s, coarse = scan(0.0, reach_s, COARSE_CLOCK_STEP_S)
+    best_s, fine = scan(coarse_s, COARSE_CLOCK_STEP_S, CLOCK_STEP_S)
+    better = min(float(coarse.min()), float(fine.min())) < CLEARLY_BETTER * float(coarse[len(coarse) // 2])
+    return best_s if better else 0.0
+
+
+def _problem(observations: ShaftObservations, config: CalibrationConfig) -> Problem:
+    return Problem.from_observations(observations, device=config.device).only(*config.measurements)
 
 
 def raise_unless_trustworthy(result: CalibrationResult) -> None:
@@ -62,9 +120,9 @@ def make_result(
     motions: Motions,
     residuals: dict[str, dict[str, Any]],
     config: CalibrationConfig,
-    head_point_error_px: dict[str, dict[str, float]] | None = None,
+    joint_columns: tuple[str, ...] = (),
 ) -> CalibrationResult:
-    """The result of one solve (no trial batch)."""
+    """The result of one solve (no trial batch); `joint_columns` name its joint offsets."""
     status, message = judge(solution)
     finite = bool(torch.isfinite(solution.camera_right_T_arm).all())
     covariance = solution.covariance.cpu().numpy()
@@ -79,8 +137,7 @@ def make_result(
         observability=observability_record(solution.observability()),
         motions=motions,
         residuals=residuals,
-        nuisances=_nuisance_records(solution),
-        head_point_error_px=head_point_error_px,
+        nuisances=_nuisance_records(solution, joint_columns),
         config=config.to_dict(),
     )
 
@@ -91,6 +148,11 @@ def judge(solution: Solution) -> tuple[Status, str]:
     observability = solution.observability()
     if status is not SolveStatus.CONVERGED:
         return "solver_failed", f"{STATUS_SENTENCES['solver_failed']}: {status.sentence}"
+    for name, nuisance in solution.nuisances.items():
+        pull = float(nuisance.pull.abs().max())
+        if pull > TOO_FAR_SIGMA:
+            where = f"the {name.replace('_', ' ')} is estimated {pull:.0f} prior sigmas from its nominal value"
+            return "weak", f"{STATUS_SENTENCES['weak']}: {where}; is a file wrong, or the clock off?"
     names: dict[str, Status] = {"trustworthy": "ok", "weak": "weak", "unobservable": "unobservable"}
     name = names[observability.verdict.value]
     return name, f"{STATUS_SENTENCES[name]}: {observability.sentence}"
@@ -145,14 +207,17 @@ def observability_record(observability: Observability) -> dict[str, Any]:
     }
 
 
-def _nuisance_records(solution: Solution) -> dict[str, dict[str, Any]]:
+def _nuisance_records(solution: Solution, joint_columns: tuple[str, ...]) -> dict[str, dict[str, Any]]:
     """Every other unknown with its sigma, and the noise levels that were used."""
     records: dict[str, dict[str, Any]] = {}
     for name, nuisance in solution.nuisances.items():
         values, sigmas, held = (item.reshape(-1).tolist() for item in (nuisance.value, nuisance.sigma, nuisance.held))
         for index, (value, sigma, is_held) in enumerate(zip(values, sigmas, held, strict=True)):
             key = name if len(values) == 1 else f"{name}[{index}]"
-            records[key] = {"value": value, "sigma": sigma, "unit": nuisance.unit, "held": is_held}
+            unit = nuisance.unit
+            if name == "joint_offset":
+                key, _, unit = f"{name} {joint_columns[index]}".rpartition("_")
+            records[key] = {"value": value, "sigma": sigma, "unit": unit, "held": is_held}
     for name, level in solution.noise.items():
         records[f"noise {name}"] = {"value": float(level), "sigma": None, "unit": _noise_unit(name)}
     return records

@@ -1,7 +1,7 @@
 """What the solver sees: batched tensors of motions and measurements, checked once.
 
-Axes: any leading trial batch, then the camera (0 right, 1 left) where a tensor has one, then N motions. A measurement that is absent is
-NaN and not valid. Units: mm, rad, s; image coordinates are normalised and undistorted (x/z, y/z).
+Axes: any leading trial batch, then the camera (0 right, 1 left) where a tensor has one, then N motions. A measurement
+that is absent is NaN and not valid. Units: mm, rad, s; image coordinates are normalised and undistorted (x/z, y/z).
 """
 
 from collections.abc import Mapping
@@ -54,7 +54,8 @@ class Problem:
         camera_T_camera_right: identity, then (with two cameras) `camera_left_T_camera_right`.
         axis_xy: two points of the axis line, RCM side first, [camera, motion, point, xy].
         axis_sigma: 1 sigma of each of these points across the line; NaN: the image noise.
-        contour_xy: [camera, motion, edge, point, xy]; edge 0 on the left-hand side of somebody who walks from the RCM side to the tip.
+        contour_xy: [camera, motion, edge, point, xy]; edge 0 on the left-hand side of somebody who walks from the RCM
+            side to the tip.
         contour_sigma: [camera, motion, edge].
         end_xy: the shaft's end on the axis; only its place along the axis is used.
         end_sigma: along the axis.
@@ -65,9 +66,9 @@ class Problem:
         rcm_p_head: the head point.
         radius_mm: of the shaft; NaN when unknown (contours are then not used).
         noise: levels, NaN where unknown.
-        joint_derivative: displacement of the shaft as a rigid body (rotation vector, translation; in `rcm`) per unit of each joint's
-            offset, [motion, 6, joint]; None when joint offsets cannot be estimated. A change of `rcm_v_axis` enters as
-            v x dv, a change of the insertion as v ds.
+        joint_derivative: displacement of the shaft as a rigid body (rotation vector, translation; in `rcm`) per unit of
+            each joint's offset, [motion, 6, joint]; None when joint offsets cannot be estimated. A change of
+            `rcm_v_axis` enters as v x dv, a change of the insertion as v ds.
         joint_offset_sigma: prior of each joint's offset, in its unit.
         clock_derivative: the same displacement per second of clock offset, [motion, 6].
         joint_offset_at: joint offsets at which the kinematics here were evaluated; None: zero.
@@ -115,13 +116,19 @@ class Problem:
     def only(self, *kinds: str) -> "Problem":
         """The problem with these kinds of measurement alone (`axis`, `contours`, `ends`, `heads`)."""
         names = {"axis": "axis_xy", "contours": "contour_xy", "ends": "end_xy", "heads": "head_xy"}
-        dropped = {name: torch.full_like(getattr(self, name), torch.nan) for kind, name in names.items() if kind not in kinds}
+        dropped = {
+            name: torch.full_like(getattr(self, name), torch.nan) for kind, name in names.items() if kind not in kinds
+        }
         return replace(self, **dropped)
 
     def cameras(self, count: int) -> "Problem":
         """The problem seen by the first `count` cameras."""
         start = len(self.batch_shape)
-        names = ("camera_T_camera_right", "valid", *(f"{k}_{s}" for k in ("axis", "contour", "end", "head") for s in ("xy", "sigma")))
+        names = (
+            "camera_T_camera_right",
+            "valid",
+            *(f"{k}_{s}" for k in ("axis", "contour", "end", "head") for s in ("xy", "sigma")),
+        )
         return replace(self, **{name: getattr(self, name).narrow(start, 0, count) for name in names})
 
     def select_motions(self, index: Tensor | slice) -> "Problem":
@@ -138,12 +145,23 @@ class Problem:
         return _map_tensors(self, lambda x, _: flat(x))
 
     def take_trials(self, index: Tensor | int) -> "Problem":
-        """The problem of some trials of the only batch axis, in this order; with a number, that trial without the axis."""
+        """The problem of some trials of the only batch axis, in this order; with a number, that trial without the
+        axis."""
         return _map_tensors(self, lambda x, _: x[index])
 
     def _map_motions(self, function: Any) -> "Problem":
         k = len(self.batch_shape)
-        after_camera = {"axis_xy", "axis_sigma", "contour_xy", "contour_sigma", "end_xy", "end_sigma", "head_xy", "head_sigma", "valid"}
+        after_camera = {
+            "axis_xy",
+            "axis_sigma",
+            "contour_xy",
+            "contour_sigma",
+            "end_xy",
+            "end_sigma",
+            "head_xy",
+            "head_sigma",
+            "valid",
+        }
         constant = {"camera_T_camera_right", "radius_mm", "joint_offset_sigma", "joint_offset_at", "clock_at"}
         changed = {}
         for field in fields(self):
@@ -158,23 +176,27 @@ class Problem:
         return cls.from_arrays({key: getattr(observations, key, None) for key in OBSERVATION_KEYS}, dtype, device)
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, Any], dtype: torch.dtype = torch.float64, device: str = "cpu") -> "Problem":
+    def from_arrays(
+        cls, arrays: Mapping[str, Any], dtype: torch.dtype = torch.float64, device: str = "cpu"
+    ) -> "Problem":
         """From arrays in the keys of an observations file, any leading trial batch.
 
-        Edges of contours are put into the canonical order. Missing arrays become NaN, missing noise levels NaN (unknown).
+        Edges of contours are put into the canonical order. Missing arrays become NaN, missing noise levels NaN
+        (unknown).
 
         Raises:
-            ObservationsError: a key is missing or an array has the wrong shape.
-            InsufficientDataError: fewer than 3 motions.
+            ObservationsError: a key is missing or an array has the wrong shape. InsufficientDataError: fewer than 3
+            motions.
         """
         return _Reader(arrays, dtype, device).problem()
 
 
 OBSERVATION_KEYS = (
-    "arm_T_rcm", "rcm_v_axis", "camera_left_T_camera_right", "axis_right", "axis_left", "contour_right", "contour_left",
-    "shaft_radius_mm", "end_right", "end_left", "rcm_s_end_mm", "head_right", "head_left", "rcm_p_head", "valid_right", "valid_left",
-    "sigma_image", "sigma_kinematics_mm", "sigma_kinematics_rad", "sigma_camera_mm", "sigma_camera_rad", "sigma_stereo_mm", "sigma_edge_bias",
-    "sigma_stereo_rad", "sigma_axis_right", "sigma_axis_left", "sigma_contour_right", "sigma_contour_left", "sigma_end_right",
+    "arm_T_rcm", "rcm_v_axis", "camera_left_T_camera_right", "axis_right", "axis_left", "contour_right",
+    "contour_left", "shaft_radius_mm", "end_right", "end_left", "rcm_s_end_mm", "head_right", "head_left",
+    "rcm_p_head", "valid_right", "valid_left", "sigma_image", "sigma_kinematics_mm", "sigma_kinematics_rad",
+    "sigma_camera_mm", "sigma_camera_rad", "sigma_stereo_mm", "sigma_edge_bias", "sigma_stereo_rad",
+    "sigma_axis_right", "sigma_axis_left", "sigma_contour_right", "sigma_contour_left", "sigma_end_right",
     "sigma_end_left", "sigma_head_right", "sigma_head_left",
 )  # fmt: skip
 
@@ -190,7 +212,9 @@ class _Reader:
         self.batch, self.n = self.poses.shape[:-3], self.poses.shape[-3]
         if self.n < MIN_MOTIONS:
             raise InsufficientDataError(where="arm_T_rcm", expected=f"at least {MIN_MOTIONS} motions", found=self.n)
-        self.sides = CAMERAS if arrays.get("camera_left_T_camera_right") is not None and self._seen("left") else CAMERAS[:1]
+        self.sides = (
+            CAMERAS if arrays.get("camera_left_T_camera_right") is not None and self._seen("left") else CAMERAS[:1]
+        )
 
     def _seen(self, side: str) -> bool:
         return any(self.arrays.get(f"{kind}_{side}") is not None for kind in ("axis", "contour", "head"))
@@ -231,7 +255,9 @@ class _Reader:
         cameras = [eye] + ([self.filled("camera_left_T_camera_right", 4, 4)] if len(self.sides) == 2 else [])
         v = self.filled("rcm_v_axis", self.n, 3)
         if not bool((torch.linalg.vector_norm(v, dim=-1) > 1e-9).all()):
-            raise ObservationsError(where="rcm_v_axis", expected="finite unit directions", found="a zero or non-finite one")
+            raise ObservationsError(
+                where="rcm_v_axis", expected="finite unit directions", found="a zero or non-finite one"
+            )
         return Problem(
             arm_T_rcm=self.poses,
             rcm_v_axis=v / torch.linalg.vector_norm(v, dim=-1, keepdim=True),
@@ -263,8 +289,11 @@ class _Reader:
 def _canonical_edges(
     contour_xy: Float[Tensor, "*batch 2 2 2"], axis_xy: Float[Tensor, "*batch 2 2"]
 ) -> Float[Tensor, "*batch 2 2 2"]:
-    """Edges swapped where edge 0 does not lie on the left-hand side (x right, y down) of the direction from the RCM side to the tip."""
-    along = torch.where(torch.isfinite(axis_xy).all(-1).all(-1)[..., None], axis_xy[..., 1, :] - axis_xy[..., 0, :], torch.nan)
+    """Edges swapped where edge 0 does not lie on the left-hand side (x right, y down) of the direction from the RCM
+    side to the tip."""
+    along = torch.where(
+        torch.isfinite(axis_xy).all(-1).all(-1)[..., None], axis_xy[..., 1, :] - axis_xy[..., 0, :], torch.nan
+    )
     own = (contour_xy[..., 1, :] - contour_xy[..., 0, :]).sum(-2)
     along = torch.where(torch.isfinite(along), along, own)
     across = contour_xy[..., 0, :, :].mean(-2) - contour_xy[..., 1, :, :].mean(-2)

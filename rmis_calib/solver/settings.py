@@ -56,19 +56,23 @@ class UnknownSettings:
     joint_offset_sigma_mm: NotNegative = 2.0
     """Prior of the offset of a prismatic joint."""
     clock: bool = True
-    """Estimate the clock offset between video and joints, where the velocities are in the problem (a continuous log)."""
+    """Estimate the clock offset between video and joints, where the velocities are in the problem (a continuous
+    log)."""
     clock_sigma_s: NotNegative = 2.0
-    """Prior of the clock offset about zero. Public recordings are off by up to 2.4 s; data that see the clock at all see it to milliseconds."""
+    """Prior of the clock offset about zero. Public recordings are off by up to 2.4 s; data that see the clock at all
+    see it to milliseconds."""
     held_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.95
     """An unknown whose sigma the data do not bring below this part of its prior is reported as held."""
 
 
 @dataclass(frozen=True, config=_STRICT)
 class VerdictSettings:
-    """When a calibration is trustworthy: the predicted error (1 sigma, root of the trace) where the instrument works."""
+    """When a calibration is trustworthy: the predicted error (1 sigma, root of the trace) where the instrument
+    works."""
 
     working_point_mm: tuple[float, float, float] | None = None
-    """Point in the right camera's frame at which the error counts; default: the mean measured shaft end or head point."""
+    """Point in the right camera's frame at which the error counts; default: the mean measured shaft end or head
+    point."""
     trustworthy_mm: Positive = 2.5
     """Predicted error at the working point below which the result is `trustworthy`."""
     unobservable_mm: Positive = 10.0
@@ -78,7 +82,8 @@ class VerdictSettings:
     unobservable_deg: Positive = 8.0
     """Predicted rotation error above which it is `unobservable`."""
     lever_mm: Positive = 50.0
-    """Length that turns a rotation into a displacement when directions are ranked: about the visible part of the shaft."""
+    """Length that turns a rotation into a displacement when directions are ranked: about the visible part of the
+    shaft."""
 
 
 @dataclass(frozen=True, config=_STRICT)
@@ -86,7 +91,8 @@ class SolverSettings:
     """Everything the solver can be told."""
 
     method: Literal["paper", "global", "joint"] = "joint"
-    """`paper`: as published; `global`: covering grid on SO(3), then translation; `joint`: weighted estimate of everything."""
+    """`paper`: as published; `global`: covering grid on SO(3), then translation; `joint`: weighted estimate of
+    everything."""
     unknowns: UnknownSettings = UnknownSettings()
     """What is estimated beside the transform (`joint`)."""
     noise: NoiseSettings = NoiseSettings()
@@ -94,14 +100,15 @@ class SolverSettings:
     verdict: VerdictSettings = VerdictSettings()
     """Thresholds of the verdict."""
     robust: Literal["auto", "on", "off"] = "auto"
-    """Outlier rejection by graduated non-convexity: `auto` where the first fit shows measurements that noise does not explain."""
+    """Outlier rejection by graduated non-convexity: `auto` where the first fit shows measurements that noise does not
+    explain."""
     outlier_probability: Annotated[float, Field(gt=0.0, lt=0.5)] = 1e-4
     """Chance of rejecting a good measurement (of one camera in one motion)."""
     bias_correction: bool = True
     """Subtract the second-order bias of errors in variables, from antithetic simulations at the estimate."""
     bias_motions: Count = 512
-    """Least number of simulated pairs that the bias is averaged over (a sixteenth of the motions where that is more). Antithetic pairs know it from 512 to
-    a few per cent of sigma at realistic noise."""
+    """Least number of simulated pairs that the bias is averaged over (a sixteenth of the motions where that is more).
+    Antithetic pairs know it from 512 to a few per cent of sigma at realistic noise."""
     grid: Annotated[int, Field(ge=24, le=20000)] = 576
     """Rotations of the covering grid."""
     minima: Annotated[int, Field(ge=1, le=64)] = 8
@@ -109,7 +116,8 @@ class SolverSettings:
     max_iterations: Count = 50
     """Steps of each refinement."""
     tolerance_sigma: Positive = 1e-3
-    """Converged when the proposed step is below this part of the standard error in every direction: step^T H step < tolerance^2."""
+    """Converged when the proposed step is below this part of the standard error in every direction: step^T H step <
+    tolerance^2."""
     start_motions: Count = 96
     """Motions that the starts compete on; all motions refine the winner."""
     thin_to: Count | None = None

@@ -70,8 +70,8 @@ _REASONS = {
 
 @dataclass(frozen=True)
 class Nuisance:
-    """An unknown that was estimated beside the transform: value, 1 sigma, unit, whether the data could not tell it (held),
-    and how many sigmas of its prior it was pulled from its nominal value."""
+    """An unknown that was estimated beside the transform: value, 1 sigma, unit, whether the data could not tell it
+    (held), and how many sigmas of its prior it was pulled from its nominal value."""
 
     value: Float[Tensor, "*batch k"]
     sigma: Float[Tensor, "*batch k"]
@@ -140,14 +140,17 @@ class Solution:
         status: `SolveStatus` codes.
         cheirality: part of the measured lines that lie in front of their camera with the tip on the imaged side.
         iterations: accepted steps.
-        chi2_per_dof: weighted squared residuals over degrees of freedom; about 1 when the noise levels are right. NaN where unknown.
-        residual_lines, residual_ends, residual_heads: rms per camera and motion, normalised units; NaN where not measured.
+        chi2_per_dof: weighted squared residuals over degrees of freedom; about 1 when the noise levels are right. NaN
+            where unknown.
+        residual_lines, residual_ends, residual_heads: rms per camera and motion, normalised units; NaN where not
+            measured.
         distance: Mahalanobis distance of each motion over the root of its rows; NaN where not measured.
         reason: `MotionReason` codes.
         noise: levels that were used, name -> value (`image`, `ends`, `heads` as factors on the nominal ones).
         nuisances: by name.
         bias: correction that was subtracted from (rotation, translation); zero when none.
-        sight: what the data can see, flat over trials (observability.py); `observability(trial)` puts one trial into words.
+        sight: what the data can see, flat over trials (observability.py); `observability(trial)` puts one trial into
+            words.
         history: cost of accepted iterates of the refinement.
         information_kept: part of the information (per parameter, geometric mean) that thinning kept; 1 without.
     """

@@ -1,0 +1,131 @@
+"""Joint offsets and the clock as unknowns: both arms' kinematics as a function of them, for the solver to iterate."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rmis_calib.geometry.rigid import rigid_inverse
+from rmis_calib.io import Recording
+from rmis_calib.kinematics import RobotKinematics
+from rmis_calib.pipeline.poses import MotionPoses
+from rmis_calib.solver import Problem
+from rmis_calib.solver.settings import UnknownSettings
+
+_STEP = {"rad": 1e-5, "mm": 1e-3}
+"""Steps of the central differences: their error, step^2 times a third derivative of order 1, is below rounding."""
+_MOVES_MM = 1e-6
+"""A joint whose unit step moves the shaft by less than this (the wrist's joints) has no offset that could be seen."""
+
+
+class KinematicUnknowns:
+    """Poses of the motions at any joint offsets and clock offset, with their derivatives."""
+
+    def __init__(self, recording: Recording, frames: np.ndarray, device: str) -> None:
+        """Keep what the poses depend on.
+
+        Args:
+            recording: robot, arms, joint log and frame times.
+            frames: (M,) frame number of each motion.
+            device: where the poses are computed.
+        """
+        self._kinematics = RobotKinematics(
+            recording.robot, recording.laparoscope_arm, recording.instrument_arm, device=device
+        )
+        arms = [arm for arm in (recording.laparoscope_arm, recording.instrument_arm) if arm is not None]
+        self.columns = tuple(column for arm in arms for column in recording.robot.columns(arm))
+        """`<arm>.<joint>_rad` or `_mm`: the joints whose offsets are unknowns, laparoscope first."""
+        self._log = recording.joints.select(self.columns)
+        self._times = recording.frame_times_s[frames] + recording.clock_offset_s
+        self._device = device
+        self._split = len(self._kinematics.laparoscope_joints)
+        steps = [_STEP[column.rpartition("_")[2]] for column in self.columns]
+        self._steps = torch.tensor(steps, dtype=torch.float64, device=device)
+
+    def prior_sigma(self, settings: UnknownSettings) -> Float[Tensor, " j"]:
+        """Prior of each offset, rad or mm; zero for a joint that does not move the shaft."""
+        sigma = {"rad": np.deg2rad(settings.joint_offset_sigma_deg), "mm": settings.joint_offset_sigma_mm}
+        values = [sigma[column.rpartition("_")[2]] for column in self.columns]
+        readings, _ = self._readings(torch.zeros(1, dtype=torch.float64))
+        moves = self._derivative(readings).abs().amax(dim=(0, 1, 2)) * self._steps / self._steps.max() > _MOVES_MM
+        return torch.where(moves, torch.tensor(values, dtype=torch.float64, device=self._device), 0.0)
+
+    def at(self, base: Problem, joint_offset: Float[Tensor, "b j"], clock_s: Float[Tensor, " b"]) -> Problem:
+        """The measurements of `base` with the kinematics evaluated at `b` sets of offsets.
+
+        Args:
+            base: one trial axis of length 1.
+            joint_offset: added to the readings, rad or mm.
+            clock_s: added to the times at which the joints are read.
+        """
+        readings, known = self._readings(clock_s)
+        arm_T_rcm, v, s_end, p_head = self._poses(readings + joint_offset[:, None])
+        repeated = base.take_trials(torch.zeros(len(clock_s), dtype=torch.int64, device=joint_offset.device))
+        return replace(
+            repeated,
+            arm_T_rcm=arm_T_rcm,
+            rcm_v_axis=v,
+            rcm_s_end_mm=s_end,
+            rcm_p_head=p_head,
+            valid=repeated.valid & known[:, None],
+            joint_offset_at=joint_offset,
+            clock_at=clock_s,
+        )
+
+    def linearised(
+        self,
+        base: Problem,
+        joint_offset: Float[Tensor, "b j"],
+        clock_s: Float[Tensor, " b"],
+        sigma: Float[Tensor, " j"],
+    ) -> Problem:
+        """The same with the derivatives that make the offsets unknowns; `sigma` is the prior of each joint's."""
+        derivative = self._derivative(self._readings(clock_s)[0] + joint_offset[:, None])
+        return replace(
+            self.at(base, joint_offset, clock_s),
+            joint_derivative=derivative,
+            joint_offset_sigma=sigma.expand(len(clock_s), -1),
+            clock_derivative=(derivative @ self._velocity(clock_s)[..., None])[..., 0],
+        )
+
+    def motion_poses(self, frames: np.ndarray, joint_offset: Float[Tensor, " j"], clock_s: float) -> MotionPoses:
+        """Poses of the motions at one set of offsets."""
+        readings, _ = self._readings(torch.tensor([clock_s], dtype=torch.float64))
+        arm_T_rcm, v, s_end, p_head = self._poses(readings[0] + joint_offset)
+        return MotionPoses(frames, arm_T_rcm, v, s_end, p_head)
+
+    def _poses(self, readings: Float[Tensor, "*batch j"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        instrument = self._kinematics.instrument(readings[..., self._split :])
+        base_T_arm = self._kinematics.base_T_arm(readings[..., : self._split])
+        arm_T_rcm = rigid_inverse(base_T_arm) @ instrument.base_T_rcm
+        return arm_T_rcm, instrument.rcm_v_axis, instrument.rcm_s_end_mm, instrument.rcm_p_head
+
+    def _readings(self, clock_s: Float[Tensor, " b"]) -> tuple[Float[Tensor, "b m j"], Tensor]:
+        """Readings at the frames' times, and where the log knows them; the nearest known time elsewhere."""
+        times = self._times + clock_s.cpu().numpy()[:, None]
+        _, known = self._log.at(times.ravel())
+        values = [np.interp(times, self._log.timestamps_s, column) for column in self._log.values.T]
+        readings = torch.as_tensor(np.stack(values, axis=-1), device=self._device)
+        return readings, torch.as_tensor(known.reshape(times.shape), device=self._device)
+
+    def _velocity(self, clock_s: Float[Tensor, " b"]) -> Float[Tensor, "b m j"]:
+        """Central difference over one sample interval of the log to either side, unit per second."""
+        step_s = float(np.median(np.diff(self._log.timestamps_s))) if len(self._log.timestamps_s) > 1 else 1.0
+        return (self._readings(clock_s + step_s)[0] - self._readings(clock_s - step_s)[0]) / (2.0 * step_s)
+
+    def _derivative(self, readings: Float[Tensor, "b m j"]) -> Float[Tensor, "b m 6 j"]:
+        """Displacement of the shaft as a rigid body, in `rcm`, per unit of each joint; all joints in one call."""
+        steps = torch.diag(self._steps)[:, None, None]
+        both = torch.stack([readings + steps, readings - steps])  # (2, j, b, m, j)
+        arm_T_rcm, v, s_end, _ = self._poses(both)
+        at_T, at_v, _, _ = self._poses(readings)
+        arm_R_rcm = at_T[..., :3, :3]
+        change, scale = arm_T_rcm[0] - arm_T_rcm[1], 2.0 * self._steps[:, None, None, None]
+        turn = arm_R_rcm.mT @ change[..., :3, :3]
+        skew = 0.5 * (turn - turn.mT)
+        omega = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1)
+        omega = omega + torch.linalg.cross(at_v.expand_as(v[0]), v[0] - v[1])
+        shift = (arm_R_rcm.mT @ change[..., :3, 3:])[..., 0] + at_v * (s_end[0] - s_end[1])[..., None]
+        return (torch.cat([omega, shift], dim=-1) / scale).permute(1, 2, 3, 0)
