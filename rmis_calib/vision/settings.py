@@ -26,7 +26,7 @@ class DetectorSettings:
     """Smallest step across a contour that counts, in units of log brightness (0.12: twelve per cent)."""
     black_level: float = Field(default=0.035, ge=0, lt=0.5)
     """Brightness, fraction of full scale, up to which a border of the picture counts as outside the field of view."""
-    min_confidence: float = Field(default=0.3, ge=0, le=1)
+    min_confidence: float = Field(default=0.25, ge=0, le=1)
     """Candidates below this confidence are not reported."""
     end_run_widths: float = Field(default=1.4, gt=0)
     """A stretch of shaft beyond an interruption (a ball, a clip) must be this many widths long to carry the end."""
