@@ -1,16 +1,21 @@
 """Second-order bias of errors in variables, from antithetic simulations at the estimate.
 
-Noise of the kinematics enters the Jacobian, the weights and the residuals of the score g = J^T S^-1 r together, and noise of the pose that a camera
-sees enters through the curvature of the projection. So E[g] at the true parameters is not zero but of second order in the noise, the same in every
-motion, while the standard error falls with N: for many motions the estimate is biased by more than its sigma (DESIGN.md, section 3). The
+Noise of the kinematics enters the Jacobian, the weights and the residuals of the score g = J^T S^-1 r together, and
+noise of the pose that a camera sees enters through the curvature of the projection. So E[g] at the true parameters is
+not zero but of second order in the noise, the same in every
+motion, while the standard error falls with N: for many motions the estimate is biased by more than its sigma
+    (DESIGN.md, section 3). The
 estimate that solves g = E[g] is free of it to that order.
 
-E[g] comes from simulating the measurement at the estimate, with the measured kinematics taken as true, and evaluating the score there: no
-simulated problem is solved. Each draw is used with both signs. Terms of first (and any odd) order in the noise cancel exactly in the mean of the pair, so
-what remains to average is the second-order term itself: one pair knows the bias to a few per cent of the standard error, where a plain
-bootstrap (DESIGN.md) with B replicas adds 1/B of the variance and needs B solves. `tests/benchmarks/bench_solver_efficiency.py` compares.
+E[g] comes from simulating the measurement at the estimate, with the measured kinematics taken as true, and evaluating
+the score there: no
+simulated problem is solved. Each draw is used with both signs. Terms of first (and any odd) order in the noise cancel
+exactly in the mean of the pair, so what remains to average is the second-order term itself: one pair knows the bias to
+a few per cent of the standard error, where a plain bootstrap (DESIGN.md) with B replicas adds 1/B of the variance and
+needs B solves. `tests/benchmarks/bench_solver_efficiency.py` compares.
 
-The same pairs correct the information: noise in J inflates J^T S^-1 J by its own variance, and 2 H - E[H] removes that to second order.
+The same pairs correct the information: noise in J inflates J^T S^-1 J by its own variance, and 2 H - E[H] removes
+that to second order.
 """
 
 from dataclasses import dataclass, replace
@@ -25,14 +30,15 @@ from rmis_calib.solver.residuals import Shaft, State, _line_geometry, predict_sh
 from rmis_calib.solver.soa import cross, dot, unit
 from rmis_calib.solver.unknowns import Layout
 
-
 SIMULATED_PART = 16
-"""One motion in so many is simulated in long recordings: the expected score is then known to about a fifth of its standard error at c = 1, much better below."""
+"""One motion in so many is simulated in long recordings: the expected score is then known to about a fifth of its
+standard error at c = 1, much better below."""
 
 
 @dataclass(frozen=True)
 class ScoreBias:
-    """Expected score and information of simulated data, summed over the motions of the problem (priors not included)."""
+    """Expected score and information of simulated data, summed over the motions of the problem (priors not
+    included)."""
 
     g: Float[Tensor, "b p"]
     H: Float[Tensor, "b p p"]
@@ -61,7 +67,8 @@ class _Draws:
 
 
 def simulate(packed: Packed, state: State, noise: NoiseModel, draws: "_Draws", sign: float) -> Packed:
-    """The measurements that the state and the measured kinematics predict, with noise of the model and these draws added."""
+    """The measurements that the state and the measured kinematics predict, with noise of the model and these draws
+    added."""
 
     def scaled(variance: Tensor, draw: Tensor) -> Tensor:
         return sign * variance.sqrt()[:, None] * draw
@@ -106,7 +113,8 @@ def expected_score(
     seed: int,
     weight: Float[Tensor, "c b n"] | None = None,
 ) -> ScoreBias:
-    """E[g] and E[H] at the state, from at least `simulated_motions` antithetic pairs (or one motion in SIMULATED_PART where that is more).
+    """E[g] and E[H] at the state, from at least `simulated_motions` antithetic pairs (or one motion in SIMULATED_PART
+    where that is more).
 
     Args:
         weight: of each camera's measurements of a motion (outliers near 0 do not take part).
@@ -121,7 +129,10 @@ def expected_score(
         picked, picked_weight = packed.take_motions(order), None if weight is None else weight[..., order]
     m = picked.motions
     step_n, step_b = min(m, chunk), max(1, chunk // min(m, chunk))
-    g, H = torch.zeros_like(layout.sigma), torch.zeros(b, layout.size, layout.size, dtype=packed.p.dtype, device=packed.p.device)
+    g, H = (
+        torch.zeros_like(layout.sigma),
+        torch.zeros(b, layout.size, layout.size, dtype=packed.p.dtype, device=packed.p.device),
+    )
     for b0 in range(0, b, step_b):
         bs = slice(b0, min(b0 + step_b, b))
         s, lay, nm = state.take(bs), layout.take(bs), noise.take(bs)

@@ -1,4 +1,5 @@
-"""Which start the joint estimate sets out from: minima of the axis planes and closed forms from contours race on a sample of the motions."""
+"""Which start the joint estimate sets out from: minima of the axis planes and closed forms from contours race on a
+sample of the motions."""
 
 from dataclasses import dataclass, replace
 
@@ -40,9 +41,15 @@ def cheirality(packed: Packed, state: State, used: Bool[Tensor, "c b n"]) -> Flo
 
 
 def compete(
-    problem: Problem, packed: Packed, order: Tensor, assumed: NoiseModel, free: dict[str, Tensor], settings: SolverSettings
+    problem: Problem,
+    packed: Packed,
+    order: Tensor,
+    assumed: NoiseModel,
+    free: dict[str, Tensor],
+    settings: SolverSettings,
 ) -> tuple[State, NoiseModel, bool]:
-    """The best start after a short refinement on a sample, noise inflated to what it explains, and whether there are outliers."""
+    """The best start after a short refinement on a sample, noise inflated to what it explains, and whether there are
+    outliers."""
     index = order[: settings.start_motions]
     sample = packed.take_motions(index)
     R, t = _starts(problem, packed, settings)
@@ -67,7 +74,8 @@ def compete(
 
 @dataclass(frozen=True)
 class _Race:
-    """Winner of a race of starts: state and noise levels per trial; whether any trial has outliers; whether no other start needs to be tried."""
+    """Winner of a race of starts: state and noise levels per trial; whether any trial has outliers; whether no other
+    start needs to be tried."""
 
     state: State
     noise: NoiseModel
@@ -75,7 +83,9 @@ class _Race:
     settled: bool
 
 
-def _starts(problem: Problem, packed: Packed, settings: SolverSettings) -> tuple[Float[Tensor, "b s 3 3"], Float[Tensor, "b s 3"]]:
+def _starts(
+    problem: Problem, packed: Packed, settings: SolverSettings
+) -> tuple[Float[Tensor, "b s 3 3"], Float[Tensor, "b s 3"]]:
     """Minima of the axis planes, and starts from contours and ends."""
     candidates = find_candidates(LineStatistics.from_problem(problem), settings.grid, settings.minima)
     chosen = candidates.order()[:, :COMPETING_MINIMA]
@@ -97,7 +107,8 @@ def _race(
     settings: SolverSettings,
     robust: bool,
 ) -> _Race:
-    """Refines every start on the sample and keeps, per trial, the one of least truncated cost among those in front of the camera."""
+    """Refines every start on the sample and keeps, per trial, the one of least truncated cost among those in front of
+    the camera."""
     b, s = R.shape[:2]
     nominal = Nominal.of(problem)
     states, kept = [], []
@@ -149,7 +160,10 @@ def _inflation(distance2: Tensor, rows: Tensor) -> Float[Tensor, " b"]:
 def _inflated(assumed: NoiseModel, free: dict[str, Tensor], distance2: Tensor, rows: Tensor) -> NoiseModel:
     """Noise levels that are to be estimated, raised to explain the median distance."""
     factor = _inflation(distance2, rows)
-    raised = {name: torch.where(value, getattr(assumed, name) * factor, getattr(assumed, name)) for name, value in free.items()}
+    raised = {
+        name: torch.where(value, getattr(assumed, name) * factor, getattr(assumed, name))
+        for name, value in free.items()
+    }
     return replace(assumed, **raised)
 
 

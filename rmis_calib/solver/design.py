@@ -1,4 +1,5 @@
-"""Which motions matter: thinning long recordings, and advice on the next motion. Both rank motions by their information on the transform."""
+"""Which motions matter: thinning long recordings, and advice on the next motion. Both rank motions by their
+information on the transform."""
 
 from dataclasses import dataclass, replace
 
@@ -43,8 +44,8 @@ def _marginal(information: Float[Tensor, "*b p p"]) -> Float[Tensor, "*b 6 6"]:
 def thin(
     information: Float[Tensor, "n p p"], prior: Float[Tensor, "p p"], count: int
 ) -> tuple[Int[Tensor, " k"], float]:
-    """Indices of `count` motions that keep most of det(information) (D-optimal, greedy in rounds), and the part kept: the geometric mean over the six
-    parameters of the transform of how much of the information is left."""
+    """Indices of `count` motions that keep most of det(information) (D-optimal, greedy in rounds), and the part kept:
+    the geometric mean over the six parameters of the transform of how much of the information is left."""
     n, p = information.shape[:2]
     scale = (information.sum(0) + prior).diagonal().clamp_min(1e-300).rsqrt()
     flat = (information * scale[:, None] * scale).flatten(1)
@@ -95,7 +96,8 @@ def advise(
     """Which of these motions would shrink the predicted error at the working point most (A-optimal for that point).
 
     Args:
-        candidates: one trial of poses within the joint limits; measurements in it say only which kinds will be measured (any finite value), their values are predicted here.
+        candidates: one trial of poses within the joint limits; measurements in it say only which kinds will be
+            measured (any finite value), their values are predicted here.
         state, layout, noise: of the present estimate, one trial.
         information: of the present estimate, priors included.
         working_point_mm: in `camera_right`.
@@ -110,11 +112,14 @@ def advise(
         return (A @ covariance_ @ A.mT).diagonal(dim1=-2, dim2=-1).sum(-1).clamp_min(0.0).sqrt()
 
     after = torch.where(visible, sigma(_marginal(information + each)), torch.inf)
-    return Advice(order=after.argsort(), sigma_mm=after, sigma_before_mm=float(sigma(_marginal(information))), visible=visible)
+    return Advice(
+        order=after.argsort(), sigma_mm=after, sigma_before_mm=float(sigma(_marginal(information))), visible=visible
+    )
 
 
 def _predicted(packed: Packed, state: State, half_view: tuple[float, float]) -> tuple[Packed, Tensor]:
-    """The candidates with noise-free measurements of what each camera would see, and which are in the right camera's view."""
+    """The candidates with noise-free measurements of what each camera would see, and which are in the right camera's
+    view."""
     shaft = predict_shaft(packed, state)
     part = torch.linspace(0.0, 1.0, ALONG_SAMPLES, dtype=shaft.D.dtype, device=shaft.D.device)
     s = part[:, None, None, None] * (packed.s_end + state.end_offset[:, None]).clamp_min(SHORTEST_VISIBLE_MM)
@@ -138,5 +143,7 @@ def _predicted(packed: Packed, state: State, half_view: tuple[float, float]) -> 
     if packed.has_ends:
         end_xy, end_ok = xy[:, -1], inside[-1] & seen
     head_ok = torch.zeros_like(packed.head_ok)
-    packed = replace(packed, line_xy=points, line_ok=seen.expand_as(packed.line_ok), end_xy=end_xy, end_ok=end_ok, head_ok=head_ok)
+    packed = replace(
+        packed, line_xy=points, line_ok=seen.expand_as(packed.line_ok), end_xy=end_xy, end_ok=end_ok, head_ok=head_ok
+    )
     return packed, seen[0, 0]

@@ -1,8 +1,12 @@
-"""Starts for the joint estimate, and the `global` method: rotation over all of SO(3), then translation, then cheirality.
+"""Starts for the joint estimate, and the `global` method: rotation over all of SO(3), then translation, then
+cheirality.
 
-**Starts from contours.** The planes of both contours have normals n0, n1 = cos(alpha) m +- sin(alpha) u (residuals.py), so one picture gives the
-axis in the camera: direction d ~ n1 x n0, half angle sin(alpha) = |n0 - n1| / 2, distance D = r / sin(alpha), nearest point D u; and with the
-shaft's end, its point in space. Directions then give R (Wahba's problem), points give R and t (absolute orientation). These starts carry where
+**Starts from contours.** The planes of both contours have normals n0, n1 = cos(alpha) m +- sin(alpha) u
+(residuals.py), so one picture gives the
+axis in the camera: direction d ~ n1 x n0, half angle sin(alpha) = |n0 - n1| / 2, distance D = r / sin(alpha), nearest
+    point D u; and with the
+shaft's end, its point in space. Directions then give R (Wahba's problem), points give R and t (absolute orientation).
+These starts carry where
 the axis planes alone are degenerate: a laparoscope that stands still, small motions.
 """
 
@@ -57,8 +61,11 @@ class Candidates:
         return self.R[rows, index], self.t[rows, index], self.cheirality[rows, index]
 
 
-def solve_translation(statistics: LineStatistics, R: Float[Tensor, "b m 3 3"]) -> tuple[Float[Tensor, "b m 3"], Float[Tensor, "b m"]]:
-    """t that minimises sum (n.(R p + t + o))^2 over all cameras, and that sum, mm^2. Paper, Eqs. 22 and 23, both cameras at once."""
+def solve_translation(
+    statistics: LineStatistics, R: Float[Tensor, "b m 3 3"]
+) -> tuple[Float[Tensor, "b m 3"], Float[Tensor, "b m"]]:
+    """t that minimises sum (n.(R p + t + o))^2 over all cameras, and that sum, mm^2. Paper, Eqs. 22 and 23, both
+    cameras at once."""
     r = vec(R)
     gram = statistics.point_gram.sum(1)
     G_tt, G_rt = gram[:, 9:, 9:], gram[:, :9, 9:]
@@ -74,9 +81,13 @@ def solve_translation(statistics: LineStatistics, R: Float[Tensor, "b m 3 3"]) -
     return t, (quadratic + (t * right).sum(-1)).clamp_min(0.0)
 
 
-def cheirality(statistics: LineStatistics, R: Float[Tensor, "b m 3 3"], t: Float[Tensor, "b m 3"]) -> Float[Tensor, "b m"]:
+def cheirality(
+    statistics: LineStatistics, R: Float[Tensor, "b m 3 3"], t: Float[Tensor, "b m 3"]
+) -> Float[Tensor, "b m"]:
     """Part of the sampled lines whose visible shaft is in front of its camera and runs to the tip as in the picture."""
-    p = (statistics.sample_p[:, None] @ R.mT + t[:, :, None])[:, :, None] + statistics.offset[:, None, :, None]  # (b, m, c, s, 3)
+    p = (statistics.sample_p[:, None] @ R.mT + t[:, :, None])[:, :, None] + statistics.offset[
+        :, None, :, None
+    ]  # (b, m, c, s, 3)
     d = (statistics.sample_v[:, None] @ R.mT)[:, :, None].expand_as(p)
     M = torch.linalg.cross(p, d)
     turn = (statistics.sample_n[:, None] * M).sum(-1)
@@ -99,7 +110,8 @@ def find_candidates(statistics: LineStatistics, grid: int, minima: int) -> Candi
 def collapsed(p: Float[Tensor, "*batch n 3"]) -> Bool[Tensor, "*batch"]:
     """Whether the RCM, in the camera's frame, has fallen into the optical centre.
 
-    Every plane through the optical centre contains p = 0, so this fits any lines of one camera without a residual. It is
+    Every plane through the optical centre contains p = 0, so this fits any lines of one camera without a residual. It
+    is
     what least squares returns where the distance of the RCM cannot be seen: one camera, and a laparoscope that does not
     move.
     """
@@ -107,7 +119,8 @@ def collapsed(p: Float[Tensor, "*batch n 3"]) -> Bool[Tensor, "*batch"]:
 
 
 def lift(statistics: LineStatistics, R: Float[Tensor, "b m 3 3"], t: Float[Tensor, "b m 3"]) -> Float[Tensor, "b m 3"]:
-    """t with a collapsed RCM moved out along the ray that all planes share, to the side where the tips point as imaged."""
+    """t with a collapsed RCM moved out along the ray that all planes share, to the side where the tips point as
+    imaged."""
     p = statistics.sample_p[:, None] @ R.mT + t[:, :, None]
     chosen = collapsed(p)
     if not bool(chosen.any()):
@@ -128,8 +141,8 @@ def _mean_distance(statistics: LineStatistics, R: Tensor, t: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class SeenAxes:
-    """What contours and ends say about each shaft, in `camera_right`: nearest point of the axis to the camera, direction, end; and their
-    weights."""
+    """What contours and ends say about each shaft, in `camera_right`: nearest point of the axis to the camera,
+    direction, end; and their weights."""
 
     nearest: Float[Tensor, "3 c b n"]
     direction: Float[Tensor, "3 c b n"]
@@ -206,17 +219,24 @@ def _length(v: Float[Tensor, "3 c b n"]) -> Float[Tensor, "c b n"]:
     return dot(v, v).sqrt()
 
 
-def _correlate(a: Float[Tensor, "3 c b n"], b: Float[Tensor, "3 c b n"], weight: Float[Tensor, "c b n"]) -> Float[Tensor, "b 3 3"]:
+def _correlate(
+    a: Float[Tensor, "3 c b n"], b: Float[Tensor, "3 c b n"], weight: Float[Tensor, "c b n"]
+) -> Float[Tensor, "b 3 3"]:
     """Weighted sum of a b^T."""
-    return torch.stack([torch.stack([(weight * a[i] * b[j]).sum((0, 2)) for j in range(3)], dim=-1) for i in range(3)], dim=-2)
+    return torch.stack(
+        [torch.stack([(weight * a[i] * b[j]).sum((0, 2)) for j in range(3)], dim=-1) for i in range(3)], dim=-2
+    )
 
 
 def _absolute_orientation(camera: Tensor, arm: Tensor, weight: Tensor, extra: Tensor) -> tuple[Tensor, Tensor]:
-    """R, t that carry arm points to camera points in the least-squares sense; `extra` adds directions to the correlation."""
+    """R, t that carry arm points to camera points in the least-squares sense; `extra` adds directions to the
+    correlation."""
     total = weight.sum((0, 2)).clamp_min(1e-12)
     camera_mean = (weight * camera).sum((1, 3)) / total  # (3, b)
     arm_mean = (weight * arm).sum((1, 3)) / total
-    R = project_to_so3(_correlate(camera - camera_mean[:, None, :, None], arm - arm_mean[:, None, :, None], weight) + extra)
+    R = project_to_so3(
+        _correlate(camera - camera_mean[:, None, :, None], arm - arm_mean[:, None, :, None], weight) + extra
+    )
     return R, camera_mean.T - (R @ arm_mean.T[..., None])[..., 0]
 
 

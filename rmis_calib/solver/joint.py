@@ -1,4 +1,5 @@
-"""The joint estimate: starts compete on a sample, outliers leave, noise levels settle, all motions refine, the bias is subtracted."""
+"""The joint estimate: starts compete on a sample, outliers leave, noise levels settle, all motions refine, the bias
+is subtracted."""
 
 from dataclasses import dataclass, replace
 
@@ -26,14 +27,16 @@ SAMPLE_MOTIONS = 512
 LONG = 32768
 """Motions of a single recording from which a sample is solved to the end and all motions then give one step..."""
 LONG_SAMPLE = 8192
-"""...from this many: the step is a few of its standard errors, and what is left after it is below a thousandth of one."""
+"""...from this many: the step is a few of its standard errors, and what is left after it is below a thousandth of
+one."""
 NOISE_ROUNDS = 2
 MAX_PASSES = 12
 MOSTLY_PRIOR = 0.9
 """Share of a direction's information from which it is the prior's: a bias there is not corrected."""
 INFORMATION_FLOOR = 0.05
-"""Least part of the raw information that the bias correction leaves in any direction. Where it would leave less, nearly all the information is noise in
-the Jacobian; sigma is then reported at least 4.5 times the raw one, which no verdict accepts."""
+"""Least part of the raw information that the bias correction leaves in any direction. Where it would leave less, nearly
+all the information is noise in the Jacobian; sigma is then reported at least 4.5 times the raw one, which no verdict
+accepts."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +150,9 @@ def _finish(
     bias = torch.zeros_like(normal.g)
     information = normal.H
     if settings.bias_correction:
-        expected = expected_score(packed, state, layout, noise, settings.bias_motions, settings.chunk, settings.seed, weight)
+        expected = expected_score(
+            packed, state, layout, noise, settings.bias_motions, settings.chunk, settings.seed, weight
+        )
         prior = with_prior(replace(normal, H=torch.zeros_like(normal.H)), layout, state).H
         delta = _seen_step(normal.H, prior, normal.g - expected.g)
         state, bias = state.moved(layout.step(delta)), -delta
@@ -181,8 +186,11 @@ def _finish(
     )
 
 
-def _seen_step(H: Float[Tensor, "b p p"], prior: Float[Tensor, "b p p"], g: Float[Tensor, "b p"]) -> Float[Tensor, "b p"]:
-    """-H^-1 g without the directions in which the data add nothing to the prior: there a simulated score is rounding."""
+def _seen_step(
+    H: Float[Tensor, "b p p"], prior: Float[Tensor, "b p p"], g: Float[Tensor, "b p"]
+) -> Float[Tensor, "b p"]:
+    """-H^-1 g without the directions in which the data add nothing to the prior: there a simulated score is
+    rounding."""
     scale = H.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
     both = scale[:, :, None] * scale[:, None]
     values, vectors = torch.linalg.eigh(torch.nan_to_num(H * both))
@@ -212,4 +220,6 @@ def floored_information(H: Float[Tensor, "b p p"], expected: Float[Tensor, "b p 
 def _check_rows(packed: Packed) -> None:
     measured = packed.rows_ok.sum((0, 2))
     if bool((measured < 6).any()):
-        raise InsufficientDataError(where="measurements", expected="at least 6 measured rows (3 lines)", found=int(measured.min()))
+        raise InsufficientDataError(
+            where="measurements", expected="at least 6 measured rows (3 lines)", found=int(measured.min())
+        )

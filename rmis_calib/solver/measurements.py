@@ -1,7 +1,9 @@
 """A problem packed for the inner loops: component first, trials and motions last, one row for each scalar measurement.
 
-A row is a *line* row (an image point that lies on a contour, `rho` = +1 or -1, or on the axis, `rho` = 0), an *end* row (where the shaft
-stops along its axis) or one of two *head* rows. Where a camera measured both contours of a motion, its axis line is dropped: detectors
+A row is a *line* row (an image point that lies on a contour, `rho` = +1 or -1, or on the axis, `rho` = 0), an *end* row
+(where the shaft stops along its axis) or one of two *head* rows. Where a camera measured both contours of a motion, its
+axis line is
+dropped: detectors
 derive the one from the other, and counting both would claim information twice.
 """
 
@@ -120,7 +122,9 @@ class Packed:
 
     def take_motions(self, index: Tensor) -> "Packed":
         """The part of the motions `index`, the same for every trial."""
-        names = [f.name for f in fields(self) if f.name not in ("camera_R", "camera_t") and getattr(self, f.name) is not None]
+        names = [
+            f.name for f in fields(self) if f.name not in ("camera_R", "camera_t") and getattr(self, f.name) is not None
+        ]
         return replace(self, **{name: getattr(self, name)[..., index] for name in names})
 
     def gather(self, trial: Tensor, motion: Tensor) -> "Packed":
@@ -163,8 +167,14 @@ def pack(problem: Problem, noise: NoiseSettings) -> Packed:
     ends_known = torch.isfinite(problem.rcm_s_end_mm)
     heads_known = torch.isfinite(problem.rcm_p_head).all(-1)
     end_xy, end_var, end_ok = _points(problem.end_xy, problem.end_sigma, problem.valid & ends_known[:, None], image)
-    head_xy, head_var, head_ok = _points(problem.head_xy, problem.head_sigma, problem.valid & heads_known[:, None], image)
-    joint = None if problem.joint_derivative is None else _to_arm(arm_R_rcm[:, :, None], batch_last(problem.joint_derivative, 2))
+    head_xy, head_var, head_ok = _points(
+        problem.head_xy, problem.head_sigma, problem.valid & heads_known[:, None], image
+    )
+    joint = (
+        None
+        if problem.joint_derivative is None
+        else _to_arm(arm_R_rcm[:, :, None], batch_last(problem.joint_derivative, 2))
+    )
     clock = None if problem.clock_derivative is None else _to_arm(arm_R_rcm, batch_last(problem.clock_derivative, 1))
     camera = problem.camera_T_camera_right.permute(2, 3, 1, 0).contiguous()
     return Packed(
@@ -205,13 +215,23 @@ def _lines(problem: Problem, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Ten
     axis_ok = axis_ok.transpose(0, 1)
     if not bool(contour_ok.any()):
         xy = torch.nan_to_num(axis).contiguous()
-        return xy, torch.zeros_like(xy[0]), axis_var.expand_as(xy[0]).contiguous(), axis_ok.expand_as(xy[0]).contiguous()
+        return (
+            xy,
+            torch.zeros_like(xy[0]),
+            axis_var.expand_as(xy[0]).contiguous(),
+            axis_ok.expand_as(xy[0]).contiguous(),
+        )
     contour = problem.contour_xy.permute(5, 3, 4, 1, 0, 2)  # (xy, edge, point, c, b, n)
     contour_sigma = torch.where(torch.isfinite(problem.contour_sigma), problem.contour_sigma, image[..., None])
     contour_var = contour_sigma.square().permute(3, 1, 0, 2)[:, None].expand(contour.shape[1:])
     contour_ok = contour_ok.transpose(0, 1)
-    rho = contour_ok.to(axis.dtype) * torch.tensor([1.0, -1.0], dtype=axis.dtype, device=axis.device)[:, None, None, None, None]
-    first = torch.tensor([True, False], device=axis.device)[:, None, None, None, None]  # an axis line takes the rows of edge 0
+    rho = (
+        contour_ok.to(axis.dtype)
+        * torch.tensor([1.0, -1.0], dtype=axis.dtype, device=axis.device)[:, None, None, None, None]
+    )
+    first = torch.tensor([True, False], device=axis.device)[
+        :, None, None, None, None
+    ]  # an axis line takes the rows of edge 0
     xy = torch.where(contour_ok, contour, axis[:, None])
     ok = contour_ok | (axis_ok & first)
     var = torch.where(contour_ok, contour_var, axis_var.expand(contour.shape[1:]))

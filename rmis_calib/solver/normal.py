@@ -1,9 +1,9 @@
 """Weighted normal equations: whiten every motion with the noise propagated from images and kinematics, and sum.
 
-The residuals of one motion have the covariance S = D + G: D diagonal, from the image; G from the motion's pose noise, which all rows share
-(`arm_T_rcm`) or the rows of one camera share (what each camera sees). In the form of residuals.py,
-G_ij = sigma_mm^2 w_i.w_j + sigma_rad^2 a_i.a_j. This is the Schur complement of a latent pose error per motion: eliminating xi from
-min |y - J xi|^2_D + |xi|^2_Sigma leaves y^T (D + J Sigma J^T)^-1 y.
+The residuals of one motion have the covariance S = D + G: D diagonal, from the image; G from the motion's pose noise,
+which all rows share (`arm_T_rcm`) or the rows of one camera share (what each camera sees). In the form of residuals.py,
+G_ij = sigma_mm^2 w_i.w_j + sigma_rad^2 a_i.a_j. This is the Schur complement of a latent pose error per motion:
+eliminating xi from min |y - J xi|^2_D + |xi|^2_Sigma leaves y^T (D + J Sigma J^T)^-1 y.
 
 S is evaluated at the *predicted* rows of the current estimate and held while the score J^T S^-1 r is driven to zero.
 """
@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rmis_calib.errors import InputError
 from rmis_calib.solver.measurements import END, HEAD, LINE, Packed
 from rmis_calib.solver.residuals import State, linearise
 from rmis_calib.solver.soa import eliminate, forward_substitute
@@ -58,6 +59,13 @@ class Normal:
     rows: Float[Tensor, " b"]
     distance2: Float[Tensor, "b n"]
     factor: Tensor | None = None
+
+    @property
+    def kept_factor(self) -> Tensor:
+        """The factor of normal equations that were made with `keep`."""
+        if self.factor is None:
+            raise InputError(where="Normal.factor", expected="normal equations made with keep=True", found="none")
+        return self.factor
 
 
 def image_variance(packed: Packed, noise: NoiseModel) -> Float[Tensor, "k b n"]:
@@ -171,7 +179,12 @@ def accumulate(
             part_weight = None if weight is None else weight[:, bs, ns]
             parts.append(normal_equations(packed.narrow(bs, ns), part_state, part_layout, part_noise, part_weight))
         per_trial.append(_joined(parts))
-    joined = Normal(**{name: torch.cat([getattr(part, name) for part in per_trial]) for name in ("H", "g", "chi2", "rows", "distance2")})
+    joined = Normal(
+        **{
+            name: torch.cat([getattr(part, name) for part in per_trial])
+            for name in ("H", "g", "chi2", "rows", "distance2")
+        }
+    )
     return with_prior(joined, layout, state)
 
 

@@ -1,8 +1,9 @@
 """What the data can see of the transform, as numbers for every trial and in words for one.
 
-Directions are ranked by what they do where the instrument works: a transform error (dphi, dt) moves a point w of `camera_right` by dphi x (w - t) + dt. So the
-covariance is carried to (lever * dphi, displacement of the working point) before its principal directions are taken, and "not observable" means a predicted error
-above a threshold in mm, not a singular matrix.
+Directions are ranked by what they do where the instrument works: a transform error (dphi, dt) moves a point w of
+`camera_right` by dphi x (w - t) + dt. So the covariance is carried to (lever * dphi, displacement of the working point)
+before its principal directions are taken, and "not observable" means a predicted error above a threshold in mm, not a
+singular matrix.
 """
 
 from enum import IntFlag
@@ -48,7 +49,8 @@ _SENTENCES = {
 
 
 def working_point(problem: Problem, R: Tensor, t: Tensor, settings: VerdictSettings) -> Float[Tensor, "b 3"]:
-    """The given point; else the mean nominal shaft end or head point seen from the camera; else 100 mm along the shaft."""
+    """The given point; else the mean nominal shaft end or head point seen from the camera; else 100 mm along the
+    shaft."""
     if settings.working_point_mm is not None:
         return torch.as_tensor(settings.working_point_mm, dtype=t.dtype, device=t.device).expand_as(t)
     rcm_p = problem.rcm_p_head
@@ -66,7 +68,12 @@ def carried(t: Float[Tensor, "*b 3"], point: Float[Tensor, "*b 3"], lever: float
 
 
 def look(
-    problem: Problem, R: Tensor, t: Tensor, covariance: Float[Tensor, "b 6 6"], settings: VerdictSettings, degeneracy: Tensor
+    problem: Problem,
+    R: Tensor,
+    t: Tensor,
+    covariance: Float[Tensor, "b 6 6"],
+    settings: VerdictSettings,
+    degeneracy: Tensor,
 ) -> Sight:
     """Predicted errors, verdict and principal directions of every trial."""
     point = working_point(problem, R, t, settings)
@@ -91,7 +98,12 @@ def look(
 
 
 def recognise(
-    problem: Problem, noise_mm: Tensor, noise_rad: Tensor, uses: tuple[bool, bool, bool], settings: NoiseSettings, distance_mm: Tensor
+    problem: Problem,
+    noise_mm: Tensor,
+    noise_rad: Tensor,
+    uses: tuple[bool, bool, bool],
+    settings: NoiseSettings,
+    distance_mm: Tensor,
 ) -> Int[Tensor, " b"]:
     """Which classical degenerate cases the motions show.
 
@@ -117,7 +129,9 @@ def recognise(
         offset = problem.camera_T_camera_right[:, 1, :3, 3]
         image = torch.nan_to_num(problem.noise.image, nan=settings.image)
         angle = torch.nan_to_num(problem.noise.stereo_rad, nan=settings.stereo_deg * torch.pi / 180.0) + 1.4 * image
-        flags = flags + Degeneracy.SHORT_BASELINE * (torch.linalg.vector_norm(offset, dim=-1) < 3.0 * angle * distance_mm)
+        flags = flags + Degeneracy.SHORT_BASELINE * (
+            torch.linalg.vector_norm(offset, dim=-1) < 3.0 * angle * distance_mm
+        )
     if not (contours or heads):
         flags = flags + int(Degeneracy.NO_DEPTH_CUE)
     if not (ends or heads):
@@ -132,7 +146,8 @@ def _spread(x: Float[Tensor, "b n 3"]) -> Float[Tensor, "b 3"]:
 
 
 def _cone(v: Float[Tensor, "b n 3"], floor: Tensor) -> Tensor:
-    """Whether all directions make one angle with one axis: the smallest principal spread of the directions is noise, and so is the width of the ring."""
+    """Whether all directions make one angle with one axis: the smallest principal spread of the directions is noise,
+    and so is the width of the ring."""
     centred = v - v.mean(-2, keepdim=True)
     _, axes = torch.linalg.eigh(centred.mT @ centred)
     flat = torch.cat((centred @ axes[..., 1:], torch.ones_like(v[..., :1])), dim=-1)
@@ -157,7 +172,8 @@ def describe(sight: Sight, trial: int) -> Observability:
         sentence = f"predicted error {at_point:.2f} mm at the working point, {rotation:.2f} deg"
     else:
         word = "is not observable" if verdict is Verdict.UNOBSERVABLE else "is only weakly observable"
-        sentence = f"{names[0]} {word} (predicted error {min(at_point, 9999.0):.1f} mm at the working point, {min(rotation, 180.0):.1f} deg)"
+        size = f"{min(at_point, 9999.0):.1f} mm at the working point, {min(rotation, 180.0):.1f} deg"
+        sentence = f"{names[0]} {word} (predicted error {size})"
         sentence += f": {_joined(reasons)}" if reasons else ""
     return Observability(
         verdict=verdict,
@@ -180,7 +196,12 @@ def _direction_name(direction: Float[Tensor, "6"], shaft: Float[Tensor, "3"]) ->
     rotating = float(turn.norm()) > float(shift.norm())
     axis = (turn if rotating else shift) / max(float((turn if rotating else shift).norm()), 1e-12)
     eye = torch.eye(3, dtype=axis.dtype, device=axis.device)
-    named = {"the viewing direction": eye[2], "the shaft": shaft, "the picture's horizontal": eye[0], "the picture's vertical": eye[1]}
+    named = {
+        "the viewing direction": eye[2],
+        "the shaft": shaft,
+        "the picture's horizontal": eye[0],
+        "the picture's vertical": eye[1],
+    }
     cosines = {name: abs(float(axis @ other)) for name, other in named.items()}
     best = max(cosines, key=lambda name: cosines[name])
     if cosines[best] < NEAR_AXIS_COS:

@@ -1,7 +1,7 @@
 """The published method, step by step, and the empirical covariance of it and of `global`.
 
-Paper, Algorithm 1: each camera gives an estimate of its own of the same unknown (the left one through n_lr = R_Z^T n_l, Eq. 8), and the two
-are averaged. Everything works on sums over motions (statistics.py).
+Paper, Algorithm 1: each camera gives an estimate of its own of the same unknown (the left one through n_lr = R_Z^T n_l,
+Eq. 8), and the two are averaged. Everything works on sums over motions (statistics.py).
 """
 
 import torch
@@ -16,29 +16,34 @@ from rmis_calib.solver.statistics import LineStatistics, plane_normals
 
 QUATERNION_STEPS = 60
 MAX_QUATERNION_STEP = 0.05
-"""Steps stay below 6 degrees, as those of a line search do: the published refinement is a local one. Unbounded Gauss-Newton steps leap from the wrong basin, into which
-the linear start falls at c = 0.5 already (164 degrees off), to the right one in about nine of ten trials; that is luck, and `global` does it by search."""
+"""Steps stay below 6 degrees, as those of a line search do: the published refinement is a local one. Unbounded
+Gauss-Newton steps leap from the wrong basin, into which the linear start falls at c = 0.5 already (164 degrees off), to
+the right one in about nine of ten trials; that is luck, and `global` does it by search."""
 QUATERNION_TOLERANCE = 1e-7
 
 
 def linear_rotation(gram: Float[Tensor, "b 9 9"]) -> Float[Tensor, "b 3 3"]:
     """Eqs. 10 to 13: smallest right singular vector, scaled by sign(det)/|det|^(1/3), then projected to SO(3).
 
-    The smallest eigenvector of the Gram matrix is the smallest right singular vector of the stacked rows. The published scaling makes the
-    determinant 1 but leaves the matrix short of orthogonal, hence the projection.
+    The smallest eigenvector of the Gram matrix is the smallest right singular vector of the stacked rows. The published
+    scaling makes the determinant 1 but leaves the matrix short of orthogonal, hence the projection.
     """
     _, vectors = torch.linalg.eigh(gram)
     V = unvec(vectors[..., 0])
     det = torch.linalg.det(V)
-    scaled = torch.where(det < 0, -1.0, 1.0)[..., None, None] * V / det.abs().clamp_min(1e-300).pow(1.0 / 3.0)[..., None, None]
+    scaled = (
+        torch.where(det < 0, -1.0, 1.0)[..., None, None]
+        * V
+        / det.abs().clamp_min(1e-300).pow(1.0 / 3.0)[..., None, None]
+    )
     return project_to_so3(scaled)
 
 
 def refine_quaternion(gram: Float[Tensor, "b 9 9"], R: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 3"]:
     """Eqs. 14 to 17: minimise sum (n.R(q) v)^2 over the unit quaternion, the gradient by autograd.
 
-    The curvature is Gauss and Newton's on the tangent space of the unit sphere (a full autograd Hessian takes 100 times as long for the same minimum); q is
-    renormalised after each step, and a step that does not lower the cost is damped.
+    The curvature is Gauss and Newton's on the tangent space of the unit sphere (a full autograd Hessian takes 100 times
+    as long for the same minimum); q is renormalised after each step, and a step that does not lower the cost is damped.
     """
     q = matrix_to_quat(R)
     eye = torch.eye(4, dtype=q.dtype, device=q.device)
@@ -66,7 +71,9 @@ def refine_quaternion(gram: Float[Tensor, "b 9 9"], R: Float[Tensor, "b 3 3"]) -
         proposal = proposal / torch.linalg.vector_norm(proposal, dim=-1, keepdim=True)
         new_cost, new_gradient, new_curvature = evaluate(proposal)
         better = new_cost <= cost
-        if not bool((better & (step.abs().amax(-1) > QUATERNION_TOLERANCE)).any()) and bool((damping > 1e3).all() | better.all()):
+        if not bool((better & (step.abs().amax(-1) > QUATERNION_TOLERANCE)).any()) and bool(
+            (damping > 1e3).all() | better.all()
+        ):
             break
         q = torch.where(better[:, None], proposal, q)
         cost = torch.where(better, new_cost, cost)
@@ -97,7 +104,9 @@ def solve_paper(statistics: LineStatistics) -> tuple[Float[Tensor, "b c 3 3"], F
     return R, torch.stack(t, dim=1)
 
 
-def average(R: Float[Tensor, "b c 3 3"], t: Float[Tensor, "b c 3"]) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"]]:
+def average(
+    R: Float[Tensor, "b c 3 3"], t: Float[Tensor, "b c 3"]
+) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"]]:
     """Last line of Algorithm 1: chordal mean of the rotations, mean of the translations."""
     return chordal_mean(R), t.mean(1)
 
@@ -107,8 +116,9 @@ def influence(
 ) -> Float[Tensor, "b n 6"]:
     """Each motion's share in the error of the two-step estimate (rotation, then translation) from these cameras.
 
-    The estimate solves sum psi_1 = 0, psi_1 = (R v x n)(n.R v), and sum psi_2 = 0, psi_2 = n (n.(R p + t + o)). To first order the error is
-    -A^-1 sum psi with A the block-triangular derivative: dphi = -H1^-1 sum psi_1, dt = -H2^-1 (sum psi_2 + B dphi). The empirical covariance is the sum of
+    The estimate solves sum psi_1 = 0, psi_1 = (R v x n)(n.R v), and sum psi_2 = 0, psi_2 = n (n.(R p + t + o)). To
+    first order the error is -A^-1 sum psi with A the block-triangular derivative: dphi = -H1^-1 sum psi_1, dt = -H2^-1
+    (sum psi_2 + B dphi). The empirical covariance is the sum of
     squared shares: it needs no noise model (White 1980).
     """
     n, _, ok = plane_normals(problem)
@@ -116,7 +126,10 @@ def influence(
     arm_v = (problem.arm_T_rcm[..., :3, :3] @ problem.rcm_v_axis[..., None])[..., 0]
     v = (arm_v @ R.mT)[:, None].expand_as(n)
     turned = problem.arm_T_rcm[..., :3, 3] @ R.mT
-    R_Z, t_Z = problem.camera_T_camera_right[:, list(cameras), :3, :3], problem.camera_T_camera_right[:, list(cameras), :3, 3]
+    R_Z, t_Z = (
+        problem.camera_T_camera_right[:, list(cameras), :3, :3],
+        problem.camera_T_camera_right[:, list(cameras), :3, 3],
+    )
     offset = (R_Z.mT @ t_Z[..., None])[..., 0][:, :, None]
     j = torch.linalg.cross(v, n) * known  # d(n.Rv)/dphi
     e1 = (n * v).sum(-1, keepdim=True)
@@ -128,7 +141,9 @@ def influence(
     psi1, psi2 = (j * e1).sum(1), (weighted * e2).sum(1)
     eye = 1e-12 * torch.eye(3, dtype=n.dtype, device=n.device)
     phi = -torch.linalg.solve(H1 + eye * H1.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None], psi1.mT).mT
-    shift = -torch.linalg.solve(H2 + eye * H2.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None], (psi2 + phi @ B.mT).mT).mT
+    shift = -torch.linalg.solve(
+        H2 + eye * H2.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None], (psi2 + phi @ B.mT).mT
+    ).mT
     return torch.cat((phi, shift), dim=-1)
 
 

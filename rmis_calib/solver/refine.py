@@ -1,6 +1,8 @@
-"""Two loops that drive the weighted score to zero: Levenberg-Marquardt from far away, Gauss-Newton passes over all motions at the end.
+"""Two loops that drive the weighted score to zero: Levenberg-Marquardt from far away, Gauss-Newton passes over all
+motions at the end.
 
-Neither knows what the residuals are. Both keep, trial by trial, the best accepted iterate, and both end with a named status.
+Neither knows what the residuals are. Both keep, trial by trial, the best accepted iterate, and both end with a named
+status.
 """
 
 from dataclasses import dataclass, replace
@@ -18,7 +20,8 @@ from rmis_calib.solver.unknowns import Layout
 INITIAL_DAMPING = 1e-4
 """Relative to the diagonal of H; starts are near a minimum, so nearly Gauss-Newton."""
 NULL_RIDGE = 1e-13
-"""Added to the unit diagonal of a scaled system: a direction that the data do not see at all would else take its step from rounding."""
+"""Added to the unit diagonal of a scaled system: a direction that the data do not see at all would else take its step
+from rounding."""
 MAX_DAMPING = 1e8
 """Past this no step goes downhill to the working precision: the loop has stalled."""
 
@@ -34,8 +37,11 @@ class Refined:
     history: tuple[Float[Tensor, " b"], ...] = ()
 
 
-def solve_system(H: Float[Tensor, "b p p"], g: Float[Tensor, "b p"], damping: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """(-(H + damping diag H)^-1 g, solvable): Cholesky after scaling to a unit diagonal, so that radians and millimetres mix.
+def solve_system(
+    H: Float[Tensor, "b p p"], g: Float[Tensor, "b p"], damping: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """(-(H + damping diag H)^-1 g, solvable): Cholesky after scaling to a unit diagonal, so that radians and
+    millimetres mix.
 
     The step is zero where the system is not positive definite, and `solvable` says so.
     """
@@ -52,11 +58,18 @@ def solve_system(H: Float[Tensor, "b p p"], g: Float[Tensor, "b p"], damping: Te
 
 
 def levenberg_marquardt(
-    packed: Packed, state: State, layout: Layout, noise: NoiseModel, tolerance: float, max_iterations: int, weight: Tensor | None = None
+    packed: Packed,
+    state: State,
+    layout: Layout,
+    noise: NoiseModel,
+    tolerance: float,
+    max_iterations: int,
+    weight: Tensor | None = None,
 ) -> Refined:
     """Minimises r^T S^-1 r + priors with S held at each accepted iterate; a step counts only if this frozen cost falls.
 
-    Converged when the undamped step d has d^T H d < tolerance^2: smaller than that part of the standard error in every direction.
+    Converged when the undamped step d has d^T H d < tolerance^2: smaller than that part of the standard error in
+    every direction.
     """
     b, device = state.t.shape[0], state.t.device
     damping = torch.full((b,), INITIAL_DAMPING, dtype=state.t.dtype, device=device)
@@ -76,7 +89,9 @@ def levenberg_marquardt(
         delta, possible = solve_system(normal.H, normal.g, damping)
         proposal = state.moved(layout.step(delta))
         deviation, prior_weight = layout.prior(proposal)
-        chi2 = frozen_chi2(normal.factor, residual_rows(packed, proposal)).sum(-1) + (prior_weight * deviation.square()).sum(-1)
+        chi2 = frozen_chi2(normal.kept_factor, residual_rows(packed, proposal)).sum(-1) + (
+            prior_weight * deviation.square()
+        ).sum(-1)
         predicted = -(delta * normal.g).sum(-1) + damping * 0.0
         accepted = running & possible & (chi2 < normal.chi2) & torch.isfinite(chi2)
         ratio = (normal.chi2 - chi2) / predicted.clamp_min(1e-300)
@@ -101,14 +116,11 @@ def polish(
     max_passes: int,
     chunk: int,
     weight: Tensor | None = None,
-    score: Float[Tensor, "b p"] | None = None,
 ) -> Refined:
     """Gauss-Newton passes over all motions, streaming, from a start within a few standard errors.
 
-    A step is kept if the next pass finds the Newton decrement g^T H^-1 g smaller; else it is undone and a quarter of it is tried.
-
-    Args:
-        score: expected score at the solution; the loop solves g = score (bias.py). Zero when absent.
+    A step is kept if the next pass finds the Newton decrement g^T H^-1 g smaller; else it is undone and a quarter of
+    it is tried.
     """
     b, device = state.t.shape[0], state.t.device
     status = torch.full((b,), SolveStatus.MAX_ITERATIONS, dtype=torch.int64, device=device)
@@ -116,15 +128,16 @@ def polish(
 
     def evaluate(at: State) -> tuple[Normal, Tensor, Tensor, Tensor]:
         normal = accumulate(packed, at, layout, noise, chunk, weight)
-        delta, solvable = solve_system(normal.H, normal.g if score is None else normal.g - score)
-        decrement = -(delta * (normal.g if score is None else normal.g - score)).sum(-1)
-        return normal, delta, solvable, decrement
+        delta, solvable = solve_system(normal.H, normal.g)
+        return normal, delta, solvable, -(delta * normal.g).sum(-1)
 
     normal, delta, solvable, decrement = evaluate(state)
     running = torch.ones_like(status, dtype=torch.bool)
     for _ in range(max_passes):
         bad = ~torch.isfinite(normal.chi2)
-        status = torch.where(running & bad, SolveStatus.NON_FINITE, torch.where(running & ~solvable, SolveStatus.SINGULAR, status))
+        status = torch.where(
+            running & bad, SolveStatus.NON_FINITE, torch.where(running & ~solvable, SolveStatus.SINGULAR, status)
+        )
         done = running & solvable & ~bad & (decrement < tolerance**2)
         status = torch.where(done, SolveStatus.CONVERGED, status)
         running = running & solvable & ~bad & ~done
@@ -147,4 +160,6 @@ def _where(chosen: Tensor, a: Normal, b: Normal) -> Normal:
     def pick(x: Tensor, y: Tensor) -> Tensor:
         return torch.where(chosen.reshape(-1, *(1,) * (x.ndim - 1)), x, y)
 
-    return replace(b, **{name: pick(getattr(a, name), getattr(b, name)) for name in ("H", "g", "chi2", "rows", "distance2")})
+    return replace(
+        b, **{name: pick(getattr(a, name), getattr(b, name)) for name in ("H", "g", "chi2", "rows", "distance2")}
+    )

@@ -1,11 +1,14 @@
 """Joint offsets and the clock: unknowns that act through the kinematics, which the solver does not know.
 
-The caller hands in `kinematics(joint_offset, clock_s)`: the problem with both arms' poses evaluated at these offsets, their derivatives with it. The solver
-estimates increments from the derivatives, has the kinematics evaluated again there, and repeats until the increments vanish.
+The caller hands in `kinematics(joint_offset, clock_s)`: the problem with both arms' poses evaluated at these offsets,
+their derivatives with it. The solver estimates increments from the derivatives, has the kinematics evaluated again
+there, and repeats until the increments vanish.
 
-**Clock start.** Offsets of seconds are far outside of any linearisation. They are found without knowing the transform: for every candidate offset the axis
-lines give a 9x9 Gram matrix and the least rotation cost over all of SO(3) (initialise.py); only the right offset makes the pictures and the joints agree. All
-candidates are one batch. It is the cross-correlation of the two motions, with the unknown rotation between them eliminated.
+**Clock start.** Offsets of seconds are far outside of any linearisation. They are found without knowing the
+transform: for every candidate offset the axis
+lines give a 9x9 Gram matrix and the least rotation cost over all of SO(3) (initialise.py); only the right offset makes
+the pictures and the joints agree. All candidates are one batch. It is the cross-correlation of the two motions, with
+the unknown rotation between them eliminated.
 """
 
 from collections.abc import Callable
@@ -30,7 +33,9 @@ SCAN_GRID = 240
 """Rotations of the covering grid during the scan of clock offsets; the motion, not the basin, is looked for."""
 
 
-def scan_clock(kinematics: Kinematics, joints: int, offsets_s: Float[Tensor, " k"]) -> tuple[float, Float[Tensor, " k"]]:
+def scan_clock(
+    kinematics: Kinematics, joints: int, offsets_s: Float[Tensor, " k"]
+) -> tuple[float, Float[Tensor, " k"]]:
     """The candidate clock offset at which lines and joints agree best, and the score of each (mean squared sine).
 
     Candidates at which fewer than half as many motions are valid as at the best covered one do not compete.

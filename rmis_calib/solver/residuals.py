@@ -1,38 +1,43 @@
 """Residuals of lines, contours, ends and head points, with their analytic Jacobians.
 
-**Geometry** (DESIGN.md, section 4). In a camera's frame let p be the RCM, d the shaft's direction (RCM to tip), M = p x d, D = |M| the
-distance of the axis from the optical centre, m = M/D, u = d x m the unit vector from the optical centre to the axis' nearest point
-c = D u, and s0 = p.d, so that p = D u + s0 d. A plane through the optical centre that touches a cylinder of radius r about the axis has
-the unit normal n with n.d = 0 and n.p = rho r, rho = +1 or -1 for the two contours: n = cos(alpha) m + rho sin(alpha) u, sin(alpha) = r/D.
-The axis itself is rho = 0, n = m.
+**Geometry** (DESIGN.md, section 4). In a camera's frame let p be the RCM, d the shaft's direction (RCM to tip), M = p x
+d, D = |M| the distance of the axis from the optical centre, m = M/D, u = d x m the unit vector from the optical centre
+to the axis' nearest point c = D u, and s0 = p.d, so that p = D u + s0 d. A plane through the optical centre that
+touches a cylinder of radius r about the axis has the unit normal n with n.d = 0 and n.p = rho r, rho = +1 or -1 for the
+two contours: n = cos(alpha) m + rho sin(alpha) u, sin(alpha) = r/D. The axis itself is rho = 0, n = m.
 
-**Line row.** For a measured image point, X = (x, y, 1), f = n.X / |n_xy| is its signed distance from the predicted line, and one unit of
-noise across the line is one unit of f. Move the shaft rigidly, so that a point of it at coordinate s from the RCM moves by
-delta(s) = dp + s dd, and let r grow by dr. Differentiating n.d = 0 and n.p = rho r gives dn = -(n.dd) d + e t with t = cos(alpha) u -
-rho sin(alpha) m, t.p = D cos(alpha), and e = (rho dr - n.dp + s0 n.dd) / (D cos(alpha)). With T = t.X the ray X touches the cylinder at
-s_X = X_d D cos(alpha) / T - s0 from the RCM, and all terms collect into
+**Line row.** For a measured image point, X = (x, y, 1), f = n.X / |n_xy| is its signed distance from the predicted
+line, and one unit of noise across the line is one unit of f. Move the shaft rigidly, so that a point of it at
+coordinate s from the RCM moves by delta(s) = dp + s dd, and let r grow by dr. Differentiating n.d = 0 and n.p = rho r
+gives dn = -(n.dd) d + e t with t = cos(alpha) u - rho sin(alpha) m, t.p = D cos(alpha), and e = (rho dr - n.dp + s0
+n.dd) / (D cos(alpha)). With T = t.X the ray X touches the cylinder at s_X = X_d D cos(alpha) / T - s0 from the RCM, and
+all terms collect into
 
     df = kappa (rho dr - n . delta(s_X)),      kappa = T / (D cos(alpha) |n_xy|):
 
-the contour moves by what the touched point moves along the normal, seen at its depth. (|n_xy| multiplies f and is held: its derivative is
-of second order at a small residual.)
+the contour moves by what the touched point moves along the normal, seen at its depth. (|n_xy| multiplies f and is held:
+its derivative is of second order at a small residual.)
 
-**End row.** chi = X_d / X_u is the tangent of the angle in the axis plane between u and the measured end's ray, which meets the axis at
-D chi - s0 from the RCM. The residual is chi - (s0 + s_e)/D, divided by |d chi / d g| for a step g along the imaged axis, so that noise along
-the axis has unit effect. Moving the shaft by delta moves the ray's meeting point by chi (u.delta) - d.delta along it:
+**End row.** chi = X_d / X_u is the tangent of the angle in the axis plane between u and the measured end's ray, which
+meets the axis at D chi - s0 from the RCM. The residual is chi - (s0 + s_e)/D, divided by |d chi / d g| for a step g
+along the imaged axis, so that noise along the axis has unit effect. Moving the shaft by delta moves the ray's meeting
+point by chi (u.delta) - d.delta along it:
 
     de = -(d - chi u) . delta(s_e) / (D |d chi / d g|),      and d e / d s_e = -1 / (D |d chi / d g|).
 
 **Head row.** y - pi(q), q the head point, pi the pinhole: de = -J_pi(q) dq.
 
-**One form for all rows.** A rigid motion of the shaft (rotation phi about the RCM, translation tau) moves a point at the vector h from the
-RCM by tau + phi x h. So each row is w.(tau + phi x h) = w.tau + a.phi with a = h x w, h = s d for lines and ends. From (w, a) follow
- - a change of the hand-eye transform, R <- exp(dphi) R, t <- t + dt: phi = dphi, tau = dphi x (p - t) + dt, so the columns are
-   (p - t) x w + a and w; the stereo extrinsics, perturbed on the right like their noise, have p x w + a and w in the rows of the left camera;
- - noise of `arm_T_rcm`: isotropic, so its covariance of rows i, j is sigma_mm^2 w_i.w_j + sigma_rad^2 a_i.a_j in any frame;
+**One form for all rows.** A rigid motion of the shaft (rotation phi about the RCM, translation tau) moves a point at
+the vector h from the RCM by tau + phi x h. So each row is w.(tau + phi x h) = w.tau + a.phi with a = h x w, h = s d for
+lines and ends. From (w, a) follow
+ - a change of the hand-eye transform, R <- exp(dphi) R, t <- t + dt: phi = dphi, tau = dphi x (p - t) + dt, so the
+   columns are (p - t) x w + a and w; the stereo extrinsics, perturbed on the right like their noise, have p x w + a and
+   w in the rows of the left camera;
+ - noise of `arm_T_rcm`: isotropic, so its covariance of rows i, j is sigma_mm^2 w_i.w_j + sigma_rad^2 a_i.a_j in any
+   frame;
  - joint offsets, clock and RCM offset: w.tau + a.phi of the displacement that they cause.
-So every nuisance and every noise source costs scalar products only. `tests/solver/test_residuals.py` holds all of this against
-`torch.func.jacrev`.
+So every nuisance and every noise source costs scalar products only. `tests/solver/test_residuals.py` holds all of this
+against `torch.func.jacrev`.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -122,7 +127,8 @@ class Shaft:
 
 @dataclass(frozen=True)
 class Rows:
-    """Residuals and first-order effects of a rigid motion of the shaft, in `camera_right`; rows of absent measurements are zero.
+    """Residuals and first-order effects of a rigid motion of the shaft, in `camera_right`; rows of absent
+    measurements are zero.
 
     Attributes:
         r: residuals, normalised image units.
@@ -149,8 +155,8 @@ def camera_rotations(packed: Packed, state: State) -> tuple[Float[Tensor, "3 3 c
 
 
 def rcm_axes(packed: Packed) -> tuple[Float[Tensor, "3 b n"], Float[Tensor, "3 b n"]]:
-    """Two unit directions across the shaft, fixed to `rcm`, in `arm`: x of `rcm` made perpendicular to the axis (y where x is
-    nearer to the axis than y), and the axis times it."""
+    """Two unit directions across the shaft, fixed to `rcm`, in `arm`: x of `rcm` made perpendicular to the axis (y
+    where x is nearer to the axis than y), and the axis times it."""
     x_along, y_along = dot(packed.R[:, 0], packed.v), dot(packed.R[:, 1], packed.v)
     first = torch.where((x_along.abs() > y_along.abs()), packed.R[:, 1], packed.R[:, 0])
     e1 = unit(first - dot(first, packed.v) * packed.v)
@@ -207,7 +213,7 @@ def linearise(packed: Packed, state: State) -> tuple[Rows, Shaft]:
     f, n, kappa, kappa_s, _ = _line_geometry(packed, state, shaft)
     w = -kappa * n
     a = -kappa_s * cross(shaft.d[:, None], n)
-    parts = [(f, w, a, kappa * packed.line_rho, torch.zeros_like(f))]
+    parts: list[tuple[Tensor, ...]] = [(f, w, a, kappa * packed.line_rho, torch.zeros_like(f))]
     if packed.has_ends:
         e, w, s, gain = _end_geometry(packed, state, shaft)
         parts.append(tuple(x.unsqueeze(x.ndim - 3) for x in (e, w, s * cross(shaft.d, w), torch.zeros_like(e), -gain)))
@@ -219,10 +225,15 @@ def linearise(packed: Packed, state: State) -> tuple[Rows, Shaft]:
     ok = packed.rows_ok
 
     def joined(i: int, vector: bool) -> Tensor:
-        pieces = [rotate_back(camera_R[:, :, None], part[i]).flatten(1, 2) if vector else part[i].flatten(0, 1) for part in parts]
+        pieces = [
+            rotate_back(camera_R[:, :, None], part[i]).flatten(1, 2) if vector else part[i].flatten(0, 1)
+            for part in parts
+        ]
         return torch.where(ok, torch.cat(pieces, dim=1 if vector else 0), 0.0)
 
-    return Rows(r=joined(0, False), w=joined(1, True), a=joined(2, True), radius=joined(3, False), end=joined(4, False)), shaft
+    return Rows(
+        r=joined(0, False), w=joined(1, True), a=joined(2, True), radius=joined(3, False), end=joined(4, False)
+    ), shaft
 
 
 def _line_geometry(packed: Packed, state: State, shaft: Shaft) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -259,5 +270,7 @@ def _head_geometry(packed: Packed, shaft: Shaft) -> tuple[Tensor, Tensor]:
     depth = torch.where(q[2].abs() < MIN_COSINE, MIN_COSINE, q[2])
     x, y, zero = q[0] / depth, q[1] / depth, torch.zeros_like(depth)
     e = torch.stack((packed.head_xy[0] - x, packed.head_xy[1] - y))
-    w = torch.stack((torch.stack((-1.0 / depth, zero)), torch.stack((zero, -1.0 / depth)), torch.stack((x / depth, y / depth))))
+    w = torch.stack(
+        (torch.stack((-1.0 / depth, zero)), torch.stack((zero, -1.0 / depth)), torch.stack((x / depth, y / depth)))
+    )
     return e, w

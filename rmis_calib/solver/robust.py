@@ -1,13 +1,14 @@
 """Outliers: graduated non-convexity on truncated least squares, one weight for each camera's measurements of a motion.
 
-A detector fails for one picture at a time: a wrong line, the other instrument, edges swapped. So the unit that is kept or dropped is (motion, camera), by
-its Mahalanobis distance d^2, which includes the noise of the kinematics; frozen joints show in both cameras. With the rejection threshold c^2 (a quantile
-of chi^2), the weights of Yang, Antonante, Tzoumas & Carlone (RA-L 2020) anneal from convex (mu small) to a hard decision:
+A detector fails for one picture at a time: a wrong line, the other instrument, edges swapped. So the unit that is kept
+or dropped is (motion, camera), by its Mahalanobis distance d^2, which includes the noise of the kinematics; frozen
+joints show in both cameras. With the rejection threshold c^2 (a quantile of chi^2), the weights of Yang, Antonante,
+Tzoumas & Carlone (RA-L 2020) anneal from convex (mu small) to a hard decision:
 
     w = 1 for d^2 <= mu/(mu+1) c^2,   0 for d^2 >= (mu+1)/mu c^2,   c sqrt(mu (mu+1)) / d - mu between.
 
-A weight enters as covariance / w, so a dropped camera costs nothing and distorts nothing. What remains is 0 or 1: efficiency and covariance are those of
-the good measurements.
+A weight enters as covariance / w, so a dropped camera costs nothing and distorts nothing. What remains is 0 or 1:
+efficiency and covariance are those of the good measurements.
 """
 
 from functools import lru_cache
@@ -39,12 +40,15 @@ def _quantiles(most_rows: int, probability: float) -> Tensor:
 
 
 def chi2_quantile(rows: Float[Tensor, "..."], probability: float) -> Float[Tensor, "..."]:
-    """Value that chi^2 with as many degrees of freedom as rows exceeds with this probability; that of one row for none."""
+    """Value that chi^2 with as many degrees of freedom as rows exceeds with this probability; that of one row for
+    none."""
     table = _quantiles(int(rows.max()) if rows.numel() else 1, probability).to(rows)
     return table[rows.long()]
 
 
-def truncated_cost(distance2: Float[Tensor, "c b n"], rows: Float[Tensor, "c b n"], probability: float) -> Float[Tensor, " b"]:
+def truncated_cost(
+    distance2: Float[Tensor, "c b n"], rows: Float[Tensor, "c b n"], probability: float
+) -> Float[Tensor, " b"]:
     """Sum of min(d^2, c^2) over cameras and motions: what competing starts are judged by."""
     limit = chi2_quantile(rows, probability)
     return torch.where(rows > 0, torch.minimum(torch.nan_to_num(distance2, nan=torch.inf), limit), 0.0).sum((0, 2))
@@ -70,7 +74,9 @@ def anneal(
             m = mu[:, None]
             soft = (limit * m * (m + 1.0) / distance2.clamp_min(1e-300)).sqrt() - m
             weight = torch.where(
-                distance2 <= m / (m + 1.0) * limit, 1.0, torch.where(distance2 >= (m + 1.0) / m * limit, MIN_WEIGHT, soft.clamp(MIN_WEIGHT, 1.0))
+                distance2 <= m / (m + 1.0) * limit,
+                1.0,
+                torch.where(distance2 >= (m + 1.0) / m * limit, MIN_WEIGHT, soft.clamp(MIN_WEIGHT, 1.0)),
             )
             mu = mu * factor
         else:
@@ -93,8 +99,8 @@ def classify(
     """`inlier_weight` of any number of motions, `chunk` at a time.
 
     Args:
-        distance2: of each motion as a whole, where it is known: a camera's own distance is never larger, so only motions above the
-            least threshold are looked at.
+        distance2: of each motion as a whole, where it is known: a camera's own distance is never larger, so only
+            motions above the least threshold are looked at.
     """
     if distance2 is not None:
         rows = torch.stack([packed.rows_ok[_rows_of(packed, c)].sum(0) for c in range(packed.cameras)])
@@ -113,7 +119,9 @@ def classify(
     for b in range(0, packed.trials, step_b):
         bs = slice(b, min(b + step_b, packed.trials))
         parts = [
-            inlier_weight(*camera_distance2(packed.narrow(bs, slice(n, n + step_n)), state.take(bs), noise.take(bs)), probability)
+            inlier_weight(
+                *camera_distance2(packed.narrow(bs, slice(n, n + step_n)), state.take(bs), noise.take(bs)), probability
+            )
             for n in range(0, packed.motions, step_n)
         ]
         weights.append(torch.cat(parts, dim=2))

@@ -1,17 +1,18 @@
 """Starts that survive many wrong lines: least absolute deviations on SO(3), from the whole covering grid.
 
-sum |n.R v| is minimised by reweighting: each candidate rotation carries its own weights 1/max(|n.R v|, floor), hence its own 9x9 Gram matrix, one
-matrix product for all of them. The median-like cost keeps its minimum with 40 % of wrong lines, where the squared cost loses it.
+sum |n.R v| is minimised by reweighting: each candidate rotation carries its own weights 1/max(|n.R v|, floor), hence
+its own 9x9 Gram matrix, one matrix product for all of them. The median-like cost keeps its minimum with 40 % of wrong
+lines, where the squared cost loses it.
 """
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rmis_calib.geometry.rotations import rotvec_to_matrix
 from rmis_calib.solver.initialise import Candidates, cheirality
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.rotation_search import derivatives, distinct_minima, newton_step, rotation_grid, vec
-from rmis_calib.geometry.rotations import rotvec_to_matrix
 from rmis_calib.solver.statistics import LineStatistics, plane_normals
 
 FLOOR = 5e-3
@@ -38,7 +39,9 @@ def robust_candidates(problem: Problem, grid: int, minima: int) -> Candidates:
         weight = 1.0 / (vec(R) @ rows.mT).abs().clamp_min(FLOOR)  # (b, g, c n)
         gram = (weight @ products).unflatten(-1, (9, 9)).flatten(0, 1)
         _, gradient, hessian, gauss_newton = derivatives(gram, R.flatten(0, 1)[:, None])
-        R = (rotvec_to_matrix(newton_step(gradient, hessian, gauss_newton))[:, 0] @ R.flatten(0, 1)).unflatten(0, (b, -1))
+        R = (rotvec_to_matrix(newton_step(gradient, hessian, gauss_newton))[:, 0] @ R.flatten(0, 1)).unflatten(
+            0, (b, -1)
+        )
     cost = (vec(R) @ rows.mT).abs().sum(-1)
     R, cost = distinct_minima(R, cost, minima)
     statistics = LineStatistics.from_problem(problem)
@@ -50,7 +53,11 @@ def robust_candidates(problem: Problem, grid: int, minima: int) -> Candidates:
 
 
 def _absolute_translation(
-    n: Float[Tensor, "b k 3"], p: Float[Tensor, "b k 3"], offset: Float[Tensor, "b k 3"], known: Float[Tensor, "b k"], R: Float[Tensor, "b m 3 3"]
+    n: Float[Tensor, "b k 3"],
+    p: Float[Tensor, "b k 3"],
+    offset: Float[Tensor, "b k 3"],
+    known: Float[Tensor, "b k"],
+    R: Float[Tensor, "b m 3 3"],
 ) -> tuple[Float[Tensor, "b m 3"], Float[Tensor, "b m"]]:
     """t that minimises sum |n.(R p + t + o)| by reweighting, and that sum, mm."""
     constant = ((p[:, None] @ R.mT + offset[:, None]) * n[:, None]).sum(-1)  # (b, m, k)

@@ -1,15 +1,16 @@
 """Global search for the rotation: every basin of the quadratic form vec(R)^T M vec(R) on SO(3).
 
-A deterministic covering grid is scored at once, its best rotations descend together by Newton steps with the exact Hessian, and the
-distinct minima are kept. Only the 9x9 matrix M enters, so the cost does not depend on the number of motions.
+A deterministic covering grid is scored at once, its best rotations descend together by Newton steps with the exact
+Hessian, and the distinct minima are kept. Only the 9x9 matrix M enters, so the cost does not depend on the number of
+motions.
 
 **Derivatives.** With R <- exp([phi]x) R, E_i = [e_i]x, Y = unvec(M vec R) and A = R Y^T, F = vec(R)^T M vec(R) has
 
     dF/dphi_i = 2 <Y, E_i R> = 2 tr(E_i A),  so  dF/dphi = 2 (A23 - A32, A31 - A13, A12 - A21),
     d2F/dphi_i dphi_j = 2 vec(E_i R)^T M vec(E_j R) + A_ij + A_ji - 2 delta_ij tr A,
 
-the last three terms from E_i E_j = e_j e_i^T - delta_ij I in the second-order part of exp. `tests/solver/test_rotation_search.py` holds both against
-autograd.
+the last three terms from E_i E_j = e_j e_i^T - delta_ij I in the second-order part of exp.
+`tests/solver/test_rotation_search.py` holds both against autograd.
 """
 
 from functools import lru_cache
@@ -21,7 +22,8 @@ from torch import Tensor
 from rmis_calib.geometry.rotations import quat_to_matrix, rotvec_to_matrix
 
 KEPT = 96
-"""Grid rotations that descend. With 576 on the grid the true basin was among the best 40 in all of 2,000 trials at c = 1."""
+"""Grid rotations that descend. With 576 on the grid the true basin was among the best 40 in all of 2,000 trials at c
+= 1."""
 DESCENT_STEPS = 12
 DISTINCT_COS = 0.995
 """Cosine of the angle below which two minima are one (5.7 degrees)."""
@@ -69,7 +71,9 @@ def derivatives(
     r = vec(R)
     y = r @ gram
     A = R @ unvec(y).mT
-    gradient = 2.0 * torch.stack((A[..., 1, 2] - A[..., 2, 1], A[..., 2, 0] - A[..., 0, 2], A[..., 0, 1] - A[..., 1, 0]), dim=-1)
+    gradient = 2.0 * torch.stack(
+        (A[..., 1, 2] - A[..., 2, 1], A[..., 2, 0] - A[..., 0, 2], A[..., 0, 1] - A[..., 1, 0]), dim=-1
+    )
     zero = torch.zeros_like(R[..., 0, :])
     x, y_row, z = R[..., 0, :], R[..., 1, :], R[..., 2, :]
     turned = torch.stack(  # E_i R, rows from E_i's pattern
@@ -128,7 +132,8 @@ def descend(gram: Float[Tensor, "b 9 9"], R: Float[Tensor, "b g 3 3"], steps: in
 
 
 def distinct_minima(R: Float[Tensor, "b g 3 3"], cost: Float[Tensor, "b g"], count: int) -> tuple[Tensor, Tensor]:
-    """The `count` lowest minima that are not the same rotation: (rotations (b, count, 3, 3), costs; infinite where there are fewer)."""
+    """The `count` lowest minima that are not the same rotation: (rotations (b, count, 3, 3), costs; infinite where
+    there are fewer)."""
     cost = cost.clone()
     rotations, costs = [], []
     for _ in range(count):
@@ -142,7 +147,8 @@ def distinct_minima(R: Float[Tensor, "b g 3 3"], cost: Float[Tensor, "b g"], cou
 
 
 def search_rotations(gram: Float[Tensor, "b 9 9"], grid: int, minima: int) -> tuple[Tensor, Tensor]:
-    """Distinct minima of vec(R)^T M vec(R) over SO(3), lowest first: (rotations (b, minima, 3, 3), costs (b, minima))."""
+    """Distinct minima of vec(R)^T M vec(R) over SO(3), lowest first: (rotations (b, minima, 3, 3), costs (b,
+    minima))."""
     rotations = rotation_grid(grid, gram)
     r = vec(rotations)
     scores = gram.flatten(1) @ (r[:, :, None] * r[:, None]).flatten(1).T  # (b, grid)

@@ -42,8 +42,8 @@ def batch_last(x: Tensor, kept: int) -> Tensor:
 def eliminate(augmented: Float[Tensor, "k cols b n"]) -> Float[Tensor, "k cols b n"]:
     """LDL^T elimination, in place, of the symmetric positive definite systems in the first k columns.
 
-    Afterwards row i, column j < i holds the multiplier l_ij, the diagonal holds the pivots d_j, and the columns past k hold
-    L^-1 B of the right-hand sides B. So B^T S^-1 B = sum_j (L^-1 B)_j (L^-1 B)_j^T / d_j.
+    Afterwards row i, column j < i holds the multiplier l_ij, the diagonal holds the pivots d_j, and the columns past k
+    hold L^-1 B of the right-hand sides B. So B^T S^-1 B = sum_j (L^-1 B)_j (L^-1 B)_j^T / d_j.
     """
     size = augmented.shape[0]
     for j in range(size - 1):

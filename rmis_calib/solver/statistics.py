@@ -1,17 +1,18 @@
 """Sufficient statistics of the axis lines: a few small matrices, whatever the number of motions.
 
-With n the unit normal of the plane through the optical centre and the imaged axis (in `camera_right`), v the shaft's direction and p the
-RCM (both in `arm`), the axis lies in the plane when
+With n the unit normal of the plane through the optical centre and the imaged axis (in `camera_right`), v the shaft's
+direction and p the RCM (both in `arm`), the axis lies in the plane when
 
-    n.R v = kron(v, n) . vec(R) = 0                       (paper, Eqs. 6 and 9)
-    n.(R p + t + o) = kron([p; 1], n) . vec([R | t + o]) = 0   (Eqs. 20 and 21; o = 0 right, R_Z^T t_Z left, Eq. 8)
+    n.R v = kron(v, n) . vec(R) = 0                       (paper, Eqs. 6 and 9) n.(R p + t + o) = kron([p; 1], n) .
+    vec([R | t + o]) = 0   (Eqs. 20 and 21; o = 0 right, R_Z^T t_Z left, Eq. 8)
 
-with column-major vec. Sums of squares of both are quadratic forms in the 9x9 and 12x12 Gram matrices of these rows. Sums over parts of the data
-add, so motions stream and partial results merge.
+with column-major vec. Sums of squares of both are quadratic forms in the 9x9 and 12x12 Gram matrices of these rows.
+Sums over parts of the data add, so motions stream and partial results merge.
 
-**Direction.** From points taken RCM side first, n = X1 x X2 is a positive multiple of p x d (both in the camera's frame) for a shaft in front of
-the camera. So sum n.(p x d) / N, linear in sum n (p x v)^T and sum n v^T, is positive for the right solution and negative for one that is
-turned round; the mean of X1 tells whether the visible part is in front.
+**Direction.** From points taken RCM side first, n = X1 x X2 is a positive multiple of p x d (both in the camera's
+frame) for a shaft in front of the camera. So sum n.(p x d) / N, linear in sum n (p x v)^T and sum n v^T, is positive
+for the right solution and negative for one that is turned round; the mean of X1 tells whether the visible part is in
+front.
 """
 
 from dataclasses import dataclass, fields
@@ -58,10 +59,17 @@ class LineStatistics:
             InputError: the two parts come from different stereo extrinsics.
         """
         if not torch.equal(self.offset, other.offset):
-            raise InputError(where="LineStatistics", expected="parts with the same stereo extrinsics", found="different ones")
-        sums = {name: getattr(self, name) + getattr(other, name) for name in ("rotation_gram", "point_gram", "turn", "count")}
+            raise InputError(
+                where="LineStatistics", expected="parts with the same stereo extrinsics", found="different ones"
+            )
+        sums = {
+            name: getattr(self, name) + getattr(other, name)
+            for name in ("rotation_gram", "point_gram", "turn", "count")
+        }
         samples = {
-            f.name: torch.cat((getattr(self, f.name), getattr(other, f.name)), dim=-2)[..., :: self._stride(other), :][..., :SAMPLE, :]
+            f.name: torch.cat((getattr(self, f.name), getattr(other, f.name)), dim=-2)[..., :: self._stride(other), :][
+                ..., :SAMPLE, :
+            ]
             for f in fields(self)
             if f.name.startswith("sample_")
         }
@@ -73,18 +81,27 @@ class LineStatistics:
     def camera(self, index: int) -> "LineStatistics":
         """Statistics of one camera alone."""
         one = slice(index, index + 1)
-        return LineStatistics(**{f.name: getattr(self, f.name)[:, one] if f.name not in ("sample_p", "sample_v") else getattr(self, f.name) for f in fields(self)})
+        return LineStatistics(
+            **{
+                f.name: getattr(self, f.name)[:, one]
+                if f.name not in ("sample_p", "sample_v")
+                else getattr(self, f.name)
+                for f in fields(self)
+            }
+        )
 
     @classmethod
     def from_problem(cls, problem: Problem, chunk: int = 16384) -> "LineStatistics":
-        """Sums of a problem with one trial axis, `chunk` motions (times trials) at a time; lines that were not measured do not count."""
+        """Sums of a problem with one trial axis, `chunk` motions (times trials) at a time; lines that were not
+        measured do not count."""
         trials, motions = problem.n_trials, problem.n_motions
         step_n = min(motions, chunk)
         step_b = max(1, chunk // step_n)
         sums = []
         for b in range(0, trials, step_b):
             parts = [
-                _sums(problem, slice(b, min(b + step_b, trials)), slice(n, min(n + step_n, motions))) for n in range(0, motions, step_n)
+                _sums(problem, slice(b, min(b + step_b, trials)), slice(n, min(n + step_n, motions)))
+                for n in range(0, motions, step_n)
             ]
             total = parts[0]
             for part in parts[1:]:
@@ -108,7 +125,8 @@ class LineStatistics:
 
 
 def _sums(problem: Problem, trials: slice, motions: slice) -> list[Tensor]:
-    """Gram matrices, turn and count of some motions; vectors by component, so that every operation runs along memory."""
+    """Gram matrices, turn and count of some motions; vectors by component, so that every operation runs along
+    memory."""
     axis, T = problem.axis_xy[trials, :, motions], problem.arm_T_rcm[trials, motions]
     x0, y0, x1, y1 = (axis[..., i, j].contiguous() for i in (0, 1) for j in (0, 1))
     ok = torch.isfinite(x0 + y0 + x1 + y1) & problem.valid[trials, :, motions]
@@ -120,7 +138,10 @@ def _sums(problem: Problem, trials: slice, motions: slice) -> list[Tensor]:
         n = [n[0] * R[:, :, 0, i] + n[1] * R[:, :, 1, i] + n[2] * R[:, :, 2, i] for i in range(3)]
     n = torch.stack(n, dim=2)  # (b, c, 3, n)
     axis_rcm = problem.rcm_v_axis[trials, motions]
-    v = [sum(T[..., i, k] * axis_rcm[..., k] for k in range(3)) for i in range(3)]
+    v = [
+        T[..., i, 0] * axis_rcm[..., 0] + T[..., i, 1] * axis_rcm[..., 1] + T[..., i, 2] * axis_rcm[..., 2]
+        for i in range(3)
+    ]
     p = [T[..., i, 3] for i in range(3)]
     one = torch.ones_like(p[0])
     left = torch.stack((*v, *p, one), dim=1)  # (b, 7, n)

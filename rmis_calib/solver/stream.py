@@ -16,16 +16,23 @@ from rmis_calib.solver.solution import SolveStatus
 from rmis_calib.solver.unknowns import Layout
 
 MAX_SAMPLE_SIGMA = 6.0
-"""Largest single step, in standard errors of the sample that it starts from; a larger one says that the sample does not speak for all motions."""
+"""Largest single step, in standard errors of the sample that it starts from; a larger one says that the sample does
+not speak for all motions."""
 
 
 def single_pass(
-    packed: Packed, state: State, layout: Layout, noise: NoiseModel, settings: SolverSettings, sample_covariance: Float[Tensor, "b p p"]
+    packed: Packed,
+    state: State,
+    layout: Layout,
+    noise: NoiseModel,
+    settings: SolverSettings,
+    sample_covariance: Float[Tensor, "b p p"],
 ) -> tuple[Refined | None, Float[Tensor, "c b n"] | None]:
-    """One Gauss-Newton step of a long recording from the estimate of a large sample, outliers taken out of the same pass.
+    """One Gauss-Newton step of a long recording from the estimate of a large sample, outliers taken out of the same
+    pass.
 
-    The step is of the order of the sample's standard error e; what it leaves is of order e^2 over the scene's size (1e-3 e or less). Returns None where
-    the step is larger than the sample allows.
+    The step is of the order of the sample's standard error e; what it leaves is of order e^2 over the scene's size
+    (1e-3 e or less). Returns None where the step is larger than the sample allows.
     """
     normal = accumulate(packed, state, layout, noise, settings.chunk)
     weight = None
@@ -36,7 +43,10 @@ def single_pass(
             out = packed.take_motions(index)
             with_all = accumulate(out, state, layout, noise, settings.chunk)
             with_rest = accumulate(out, state, layout, noise, settings.chunk, weight[..., index])
-            changed = {name: getattr(normal, name) - getattr(with_all, name) + getattr(with_rest, name) for name in ("H", "g", "chi2")}
+            changed = {
+                name: getattr(normal, name) - getattr(with_all, name) + getattr(with_rest, name)
+                for name in ("H", "g", "chi2")
+            }
             normal = replace(normal, **changed)
     delta, solvable = solve_system(normal.H, normal.g)
     whitened = torch.linalg.solve(sample_covariance, delta[..., None])[..., 0]

@@ -25,8 +25,8 @@ UNITS = {
 
 
 TRANSLATION_SIGMA_MM = 2000.0
-"""Prior of the hand-eye translation about zero: no arm is longer. It moves a translation of 200 mm known to 1 mm by 5e-5 mm, and keeps one that the data
-cannot see within the operating theatre."""
+"""Prior of the hand-eye translation about zero: no arm is longer. It moves a translation of 200 mm known to 1 mm by
+5e-5 mm, and keeps one that the data cannot see within the operating theatre."""
 
 EDGE_BIAS = "edge_bias"
 """Block of the shifts that `systematic.py` considers; never one of the unknowns."""
@@ -60,7 +60,8 @@ class Layout:
     def prior(self, state: State) -> tuple[Float[Tensor, "b p"], Float[Tensor, "b p"]]:
         """Deviation of the state from the priors' centre, and their weights 1/sigma^2.
 
-        The stereo rotation's deviation is the vector of (R - R^T)/2, its sine: within 1e-5 of the angle up to half a degree.
+        The stereo rotation's deviation is the vector of (R - R^T)/2, its sine: within 1e-5 of the angle up to half a
+        degree.
         """
         zero, origin = torch.zeros_like(state.t), self.origin
         turned = origin.stereo_R.mT @ state.stereo_R
@@ -68,7 +69,8 @@ class Layout:
         deviation = {
             "rotation": zero,
             "translation": state.t,
-            "stereo_rotation": 0.5 * torch.stack([turned[:, i, j] - turned[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], dim=-1),
+            "stereo_rotation": 0.5
+            * torch.stack([turned[:, i, j] - turned[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], dim=-1),
             "stereo_translation": shifted,
             "radius": (state.radius - origin.radius)[:, None],
             "end_offset": (state.end_offset - origin.end_offset)[:, None],
@@ -83,7 +85,8 @@ class Layout:
 
 @dataclass(frozen=True)
 class Nominal:
-    """What a problem gives once a trial: the nominal values of the unknowns beside the transform, and their priors where the data name them.
+    """What a problem gives once a trial: the nominal values of the unknowns beside the transform, and their priors
+    where the data name them.
 
     Attributes:
         stereo: `camera_T_camera_right` of the last camera.
@@ -137,7 +140,9 @@ def initial_state(nominal: Nominal, R: Float[Tensor, "b 3 3"], t: Float[Tensor, 
     )
 
 
-def make_layout(nominal: Nominal, packed: Packed, origin: State, settings: UnknownSettings, noise: NoiseSettings) -> Layout:
+def make_layout(
+    nominal: Nominal, packed: Packed, origin: State, settings: UnknownSettings, noise: NoiseSettings
+) -> Layout:
     """The parameters that the settings ask for and the measurements can carry.
 
     Offsets of a state count from where the kinematics were evaluated, their priors from zero.
@@ -194,7 +199,10 @@ def columns(layout: Layout, rows: Rows, shaft: Shaft, packed: Packed, state: Sta
     if "rcm_offset" in layout.blocks:
         put("rcm_offset", torch.stack([dot(rows.w, rotate(R, e)[:, None]) for e in rcm_axes(packed)], dim=1))
     if "joint_offset" in layout.blocks and packed.joint is not None:
-        put("joint_offset", torch.stack([_effect(rows, R, packed.joint[:, j]) for j in range(packed.joint.shape[1])], dim=1))
+        put(
+            "joint_offset",
+            torch.stack([_effect(rows, R, packed.joint[:, j]) for j in range(packed.joint.shape[1])], dim=1),
+        )
     if "clock" in layout.blocks and packed.clock is not None:
         put("clock", _effect(rows, R, packed.clock)[:, None])
     if EDGE_BIAS in layout.blocks:

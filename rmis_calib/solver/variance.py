@@ -1,12 +1,15 @@
 """Noise levels from the data: variance components by restricted maximum likelihood, Fisher scoring.
 
-The covariance of one motion's residuals is linear in the components, S = sum_j v_j Q_j: image points on lines, ends, heads (Q diagonal),
-position and orientation of the kinematics (Q = W W^T and A A^T of residuals.py). With a = S^-1 r and the projection that the estimated
-parameters cost, the restricted likelihood has (Patterson & Thompson 1971; Searle, Casella & McCulloch 1992, ch. 8)
+The covariance of one motion's residuals is linear in the components, S = sum_j v_j Q_j: image points on lines, ends,
+heads (Q diagonal), position and orientation of the kinematics (Q = W W^T and A A^T of residuals.py). With a = S^-1 r
+and the projection that the estimated parameters cost, the restricted likelihood has (Patterson & Thompson 1971; Searle,
+Casella & McCulloch 1992, ch. 8)
 
-    score_j = 1/2 [ sum a^T Q_j a - sum tr(S^-1 Q_j) + tr(H^-1 sum J^T S^-1 Q_j S^-1 J) ],   F_ij = 1/2 sum tr(S^-1 Q_i S^-1 Q_j).
+    score_j = 1/2 [ sum a^T Q_j a - sum tr(S^-1 Q_j) + tr(H^-1 sum J^T S^-1 Q_j S^-1 J) ],
+    F_ij = 1/2 sum tr(S^-1 Q_i S^-1 Q_j).
 
-Steps are taken in log v_j, with a Gaussian prior about the assumed level: components that the data cannot separate (one camera, few motions) stay near it.
+Steps are taken in log v_j, with a Gaussian prior about the assumed level: components that the data cannot separate
+(one camera, few motions) stay near it.
 """
 
 import math
@@ -31,17 +34,31 @@ SETTLED = 0.02
 
 
 def assumed_noise(problem: Problem, settings: NoiseSettings) -> tuple[NoiseModel, dict[str, Tensor]]:
-    """Noise levels given by the problem, else those of the settings; and per component (b,) whether it is to be estimated."""
+    """Noise levels given by the problem, else those of the settings; and per component (b,) whether it is to be
+    estimated."""
     given = problem.noise
     one = torch.ones_like(given.image)
-    free_image = torch.isnan(given.image) if settings.estimate == "auto" else one.bool() & (settings.estimate == "always")
-    free = dict.fromkeys(("line", "end", "head"), free_image)
+    free_image = (
+        torch.isnan(given.image) if settings.estimate == "auto" else one.bool() & (settings.estimate == "always")
+    )
+    free: dict[str, Tensor] = {name: free_image for name in ("line", "end", "head")}
     levels = {}
-    for name, assumed in (("kinematics_mm", settings.kinematics_mm), ("kinematics_rad", math.radians(settings.kinematics_deg))):
+    for name, assumed in (
+        ("kinematics_mm", settings.kinematics_mm),
+        ("kinematics_rad", math.radians(settings.kinematics_deg)),
+    ):
         value = getattr(given, name)
-        free[name] = torch.isnan(value) if settings.estimate == "auto" else free_image & True if settings.estimate == "never" else one.bool()
+        free[name] = (
+            torch.isnan(value)
+            if settings.estimate == "auto"
+            else free_image & True
+            if settings.estimate == "never"
+            else one.bool()
+        )
         levels[name] = torch.nan_to_num(value, nan=assumed).square()
-    model = NoiseModel(one, one, one, **levels, camera_mm=given.camera_mm.square(), camera_rad=given.camera_rad.square())
+    model = NoiseModel(
+        one, one, one, **levels, camera_mm=given.camera_mm.square(), camera_rad=given.camera_rad.square()
+    )
     return model, free
 
 
@@ -76,10 +93,14 @@ def estimate_components(
         score, fisher = _score(packed, rows, J, r, noise, parts, layout)
         v = theta.exp()
         score = v * score - prior * (theta - centre)
-        fisher = v[:, :, None] * v[:, None] * fisher + prior * torch.eye(len(COMPONENTS), dtype=v.dtype, device=v.device)
+        fisher = v[:, :, None] * v[:, None] * fisher + prior * torch.eye(
+            len(COMPONENTS), dtype=v.dtype, device=v.device
+        )
         fixed = ~free_mask
         fisher = torch.where(fixed[:, :, None] | fixed[:, None], torch.diag_embed(torch.ones_like(v)), fisher)
-        step = torch.linalg.solve(fisher, torch.where(fixed, 0.0, score)[..., None])[..., 0].clamp(-MAX_LOG_STEP, MAX_LOG_STEP)
+        step = torch.linalg.solve(fisher, torch.where(fixed, 0.0, score)[..., None])[..., 0].clamp(
+            -MAX_LOG_STEP, MAX_LOG_STEP
+        )
         moved = torch.where(fixed, v, (theta + step).exp())
         noise = replace(noise, **{name: moved[:, i] for i, name in enumerate(COMPONENTS)})
         if not bool((torch.where(fixed, 0.0, step).abs() > SETTLED).any()):
@@ -105,7 +126,13 @@ def _component_matrices(packed: Packed, rows: Rows) -> tuple[list[Tensor], Tenso
 
 
 def _score(
-    packed: Packed, rows: Rows, J: Tensor, r: Tensor, noise: NoiseModel, parts: tuple[list[Tensor], Tensor], layout: Layout
+    packed: Packed,
+    rows: Rows,
+    J: Tensor,
+    r: Tensor,
+    noise: NoiseModel,
+    parts: tuple[list[Tensor], Tensor],
+    layout: Layout,
 ) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b m m"]]:
     """Score with respect to each variance, and the Fisher information."""
     k, b, n = rows.r.shape

@@ -1,4 +1,5 @@
-"""Shared by the solver's benchmarks: noisy trials from the independent simulation, the bound for their exact noise, and errors."""
+"""Shared by the solver's benchmarks: noisy trials from the independent simulation, the bound for their exact noise,
+and errors."""
 
 import time
 from collections.abc import Callable
@@ -32,7 +33,9 @@ def level(c: float, px: float = 0.5) -> Noise:
     return (px, c, c, c, c, c, c)
 
 
-def config(noise: Noise, trials: int, seed: int = 0, laparoscope: int = 3, instrument: int = 4, **more: object) -> LineStudyConfig:
+def config(
+    noise: Noise, trials: int, seed: int = 0, laparoscope: int = 3, instrument: int = 4, **more: object
+) -> LineStudyConfig:
     px, kin_mm, kin_deg, cam_mm, cam_deg, stereo_mm, stereo_deg = noise
     return LineStudyConfig(
         trials=trials, seed=seed, positions_laparoscope=laparoscope, positions_instrument=instrument, pixel_noise_px=px,
@@ -58,17 +61,26 @@ class Study:
         return float(self.bound[..., 3:, 3:].diagonal(dim1=-2, dim2=-1).sum(-1).sqrt().mean())
 
 
-def study(settings: LineStudyConfig, kinds: tuple[str, ...], cameras: int = 2, unknowns: UnknownSettings = KNOWN_RADIUS) -> Study:
-    """Simulated trials restricted to some measurements, with their bound: the information at the true transform, poses and extrinsics."""
+def study(
+    settings: LineStudyConfig, kinds: tuple[str, ...], cameras: int = 2, unknowns: UnknownSettings = KNOWN_RADIUS
+) -> Study:
+    """Simulated trials restricted to some measurements, with their bound: the information at the true transform,
+    poses and extrinsics."""
     data = simulate_lines(settings)
     truth = data["truth"]
     problem = Problem.from_arrays(data).only(*kinds).cameras(cameras)
-    exact = dict(data) | {"arm_T_rcm": truth["arm_T_rcm"], "camera_left_T_camera_right": truth["camera_left_T_camera_right"]}
+    exact = dict(data) | {
+        "arm_T_rcm": truth["arm_T_rcm"],
+        "camera_left_T_camera_right": truth["camera_left_T_camera_right"],
+    }
     clean = Problem.from_arrays(exact).only(*kinds).cameras(cameras)
     X = torch.as_tensor(truth["camera_right_T_arm"])
     solver = SolverSettings(unknowns=unknowns)
     packed = pack(clean, solver.noise)
-    state = replace(initial_state(Nominal.of(clean), X[:, :3, :3], X[:, :3, 3]), end_offset=torch.full_like(X[:, 0, 0], truth["shaft_end_offset_mm"]))
+    state = replace(
+        initial_state(Nominal.of(clean), X[:, :3, :3], X[:, :3, 3]),
+        end_offset=torch.full_like(X[:, 0, 0], truth["shaft_end_offset_mm"]),
+    )
     layout = make_layout(Nominal.of(clean), packed, state, unknowns, solver.noise)
     noise, _ = assumed_noise(clean, solver.noise)
     information = accumulate(packed, state, layout, noise, solver.chunk).H

@@ -1,6 +1,7 @@
-"""Coverage: how often the 95 % ellipsoid of the reported covariance holds the truth, with given and with estimated noise levels.
+"""Coverage: how often the 95 % ellipsoid of the reported covariance holds the truth, with given and with estimated
+noise levels.
 
-    python tests/benchmarks/bench_solver_coverage.py [--trials 1000]
+python tests/benchmarks/bench_solver_coverage.py [--trials 1000]
 """
 
 import argparse
@@ -31,7 +32,9 @@ def main() -> int:
     parser.add_argument("--only", type=int, nargs="*")
     args = parser.parse_args()
     bad = 0
-    print(f"{'scene':34} {'N':>4} | noise given | noise estimated   (part of {args.trials} trials inside; 0.93 to 0.97 wanted)")
+    print(
+        f"{'scene':34} {'N':>4} | noise given | noise estimated   (part of {args.trials} trials inside; 0.93 to 0.97 wanted)"
+    )
     for i, (name, kinds, cameras, motion, laparoscope) in enumerate(CELLS):
         if args.only and i not in args.only:
             continue
@@ -39,7 +42,8 @@ def main() -> int:
         inside, scale = [], []
         noise = trial.problem.noise
         unknown = torch.full_like(noise.image, torch.nan)
-        # Image points keep their nominal sigma, as a detector gives it; the common factor and the kinematics are unknown.
+        # Image points keep their nominal sigma, as a detector gives it; the common factor and the kinematics are
+        # unknown.
         free = replace(trial.problem, noise=replace(noise, kinematics_mm=unknown, kinematics_rad=unknown))
         always = replace(SolverSettings(unknowns=KNOWN_RADIUS).noise, estimate="always")
         for problem, settings in (
@@ -52,7 +56,10 @@ def main() -> int:
             inside.append(float((distance2 < QUANTILE_95).double().mean()))
             scale.append(float(distance2.mean() / 6.0))
             bad += not 0.93 <= inside[-1] <= 0.97
-        print(f"{name:34} {trial.problem.n_motions:4d} |   {inside[0]:.3f}     |   {inside[1]:.3f}      mean d^2/6: {scale[0]:.2f}, {scale[1]:.2f}", flush=True)
+        print(
+            f"{name:34} {trial.problem.n_motions:4d} |   {inside[0]:.3f}     |   {inside[1]:.3f}      mean d^2/6: {scale[0]:.2f}, {scale[1]:.2f}",
+            flush=True,
+        )
     return 1 if bad else 0
 
 

@@ -1,6 +1,7 @@
-"""Efficiency: rmse over the Cramer-Rao bound, rotation and translation, of `joint` with and without the bias correction.
+"""Efficiency: rmse over the Cramer-Rao bound, rotation and translation, of `joint` with and without the bias
+correction.
 
-    python tests/benchmarks/bench_solver_efficiency.py [--trials 200] [--out FILE.json]
+python tests/benchmarks/bench_solver_efficiency.py [--trials 200] [--out FILE.json]
 """
 
 import argparse
@@ -12,9 +13,18 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from tests.benchmarks.bench_solver_common import KNOWN_RADIUS, REALISTIC, config, errors, level, rms, rotation_deg, study, translation_mm
-
 from rmis_calib.solver import SolverSettings, solve
+from tests.benchmarks.bench_solver_common import (
+    KNOWN_RADIUS,
+    REALISTIC,
+    config,
+    errors,
+    level,
+    rms,
+    rotation_deg,
+    study,
+    translation_mm,
+)
 
 CELLS = [("realistic", REALISTIC), ("c = 0.5", level(0.5)), ("c = 1", level(1.0)), ("c = 2", level(2.0))]
 LIMITS = {"realistic": 1.1, "c = 0.5": 1.15, "c = 1": 1.2}
@@ -25,7 +35,13 @@ def cell(name, noise, kinds, laparoscope, instrument, cameras, trials, **more):
     """One row of the table."""
     start = time.time()
     trial = study(config(noise, trials, 1, laparoscope, instrument, **more), kinds, cameras)
-    row = {"noise": name, "N": trial.problem.n_motions, "kinds": "+".join(kinds), "cameras": cameras, "static": laparoscope == 1}
+    row = {
+        "noise": name,
+        "N": trial.problem.n_motions,
+        "kinds": "+".join(kinds),
+        "cameras": cameras,
+        "static": laparoscope == 1,
+    }
     row |= {"bound_deg": trial.bound_deg, "bound_mm": trial.bound_mm}
     settings = SolverSettings(unknowns=KNOWN_RADIUS)
     for label, chosen in (("plain", replace(settings, bias_correction=False)), ("joint", settings)):
@@ -33,7 +49,10 @@ def cell(name, noise, kinds, laparoscope, instrument, cameras, trials, **more):
         e = errors(solution.camera_right_T_arm, trial.truth)
         row[f"{label}_deg"], row[f"{label}_mm"] = rms(rotation_deg(e)), rms(translation_mm(e))
         row[f"{label}_worst_deg"] = float(rotation_deg(e).max())
-        row[f"{label}_ratio_deg"], row[f"{label}_ratio_mm"] = row[f"{label}_deg"] / trial.bound_deg, row[f"{label}_mm"] / trial.bound_mm
+        row[f"{label}_ratio_deg"], row[f"{label}_ratio_mm"] = (
+            row[f"{label}_deg"] / trial.bound_deg,
+            row[f"{label}_mm"] / trial.bound_mm,
+        )
     row["seconds"] = time.time() - start
     return row
 
@@ -44,10 +63,15 @@ def main():
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     rows, bad = [], []
-    print(f"{'noise':10} {'N':>5} {'measurements':14} {'cams':>4} | {'bound':>16} | {'without correction':>18} | {'joint':>12} | worst deg")
+    print(
+        f"{'noise':10} {'N':>5} {'measurements':14} {'cams':>4} | {'bound':>16} | {'without correction':>18} | {'joint':>12} | worst deg"
+    )
     for name, noise in CELLS:
         for _, kinds in KINDS:
-            for more in ({}, {"motion": "random", "random_motions": 343}):  # the grid of 1,728, and 343 at random in the same range
+            for more in (
+                {},
+                {"motion": "random", "random_motions": 343},
+            ):  # the grid of 1,728, and 343 at random in the same range
                 rows.append(cell(name, noise, kinds, 3, 4, 2, args.trials, **more))
                 report(rows[-1], bad)
     rows.append(cell("realistic", REALISTIC, ("contours", "ends"), 1, 7, 1, args.trials))

@@ -2,7 +2,8 @@
 
     python tests/benchmarks/bench_solver_outliers.py [--trials 50]
 
-Wrong lines fall into one camera at a time; the second instrument passes through another RCM and is seen by both cameras consistently.
+Wrong lines fall into one camera at a time; the second instrument passes through another RCM and is seen by both
+cameras consistently.
 """
 
 import argparse
@@ -17,7 +18,17 @@ import torch
 from rmis_calib.geometry.lines import contour_planes
 from rmis_calib.geometry.rotations import rotvec_to_matrix
 from rmis_calib.solver import Problem, SolverSettings, solve
-from tests.benchmarks.bench_solver_common import KNOWN_RADIUS, REALISTIC, Study, config, errors, rms, rotation_deg, study, translation_mm
+from tests.benchmarks.bench_solver_common import (
+    KNOWN_RADIUS,
+    REALISTIC,
+    Study,
+    config,
+    errors,
+    rms,
+    rotation_deg,
+    study,
+    translation_mm,
+)
 
 GROSS, SECOND = 0.3, 0.1
 
@@ -29,11 +40,21 @@ def contaminate(trial: Study, gross: float, second: float, seed: int) -> Problem
     b, c, n = problem.valid.shape
     wrong = torch.rand(b, c, n, generator=generator) < gross
     other = (torch.rand(b, 1, n, generator=generator) < second).expand(b, c, n)
-    points = (torch.rand(b, c, n, 2, 2, generator=generator, dtype=torch.float64) - 0.5) * torch.tensor([1.2, 0.9], dtype=torch.float64)
+    points = (torch.rand(b, c, n, 2, 2, generator=generator, dtype=torch.float64) - 0.5) * torch.tensor(
+        [1.2, 0.9], dtype=torch.float64
+    )
     width = 0.03 + 0.05 * torch.rand(b, c, n, 1, generator=generator, dtype=torch.float64)
     across = points[..., 1, :] - points[..., 0, :]
-    across = torch.stack((across[..., 1], -across[..., 0]), -1) / torch.linalg.vector_norm(across, dim=-1, keepdim=True) * width
-    random = {"axis_xy": points, "contour_xy": torch.stack((points + across[..., None, :], points - across[..., None, :]), -3), "end_xy": points[..., 1, :]}
+    across = (
+        torch.stack((across[..., 1], -across[..., 0]), -1)
+        / torch.linalg.vector_norm(across, dim=-1, keepdim=True)
+        * width
+    )
+    random = {
+        "axis_xy": points,
+        "contour_xy": torch.stack((points + across[..., None, :], points - across[..., None, :]), -3),
+        "end_xy": points[..., 1, :],
+    }
     tilt = rotvec_to_matrix(torch.tensor([0.0, 0.2, 2.2], dtype=torch.float64))
     foreign = _seen(problem, X, tilt, torch.tensor([-170.0, 30.0, 5.0], dtype=torch.float64))
     changed = {}
@@ -46,7 +67,8 @@ def contaminate(trial: Study, gross: float, second: float, seed: int) -> Problem
 
 
 def _seen(problem: Problem, X, tilt, shift) -> dict:
-    """What the cameras see of a shaft that moves like the first one but turned and shifted in the right camera's frame."""
+    """What the cameras see of a shaft that moves like the first one but turned and shifted in the right camera's
+    frame."""
     right = X[:, None] @ problem.arm_T_rcm
     p = right[..., :3, 3] @ tilt.T + shift
     v = (right[..., :3, :3] @ problem.rcm_v_axis[..., None])[..., 0] @ tilt.T
@@ -57,7 +79,10 @@ def _seen(problem: Problem, X, tilt, shift) -> dict:
         along = torch.stack([q + s * d for s in (60.0, 110.0)], dim=-2)  # (b, n, 2, 3)
         out["axis_xy"].append(along[..., :2] / along[..., 2:].clamp_min(1.0))
         planes = contour_planes(q, d, problem.radius_mm[:, None].expand(q.shape[:-1]))
-        touch = along[..., None, :, :] - (along[..., None, :, :] * planes[..., None, :]).sum(-1, keepdim=True) * planes[..., None, :]
+        touch = (
+            along[..., None, :, :]
+            - (along[..., None, :, :] * planes[..., None, :]).sum(-1, keepdim=True) * planes[..., None, :]
+        )
         out["contour_xy"].append(touch[..., :2] / touch[..., 2:].clamp_min(1.0))
         out["end_xy"].append(along[..., 1, :2] / along[..., 1, 2:].clamp_min(1.0))
     return {name: torch.stack(value, dim=1) for name, value in out.items()}
@@ -79,7 +104,9 @@ def main() -> int:
                 dirty = contaminate(trial, GROSS, SECOND, 5)
                 clean = errors(solve(trial.problem, settings).camera_right_T_arm, trial.truth)
                 e = errors(solve(dirty, settings).camera_right_T_arm, trial.truth)
-                ratio = max(rms(rotation_deg(e)) / rms(rotation_deg(clean)), rms(translation_mm(e)) / rms(translation_mm(clean)))
+                ratio = max(
+                    rms(rotation_deg(e)) / rms(rotation_deg(clean)), rms(translation_mm(e)) / rms(translation_mm(clean))
+                )
                 bad += ratio > 1.5
                 print(
                     f"{trial.problem.n_motions:7d}  {'moves' if laparoscope > 1 else 'static':11}  {'+'.join(kinds):16} {cameras:4d} | "

@@ -1,6 +1,6 @@
 """Speed: warm medians, and SciPy's least_squares on the same problem in the same run.
 
-    python tests/benchmarks/bench_solver_speed.py [--quick]
+python tests/benchmarks/bench_solver_speed.py [--quick]
 """
 
 import argparse
@@ -19,15 +19,30 @@ from scipy.spatial.transform import Rotation
 
 from rmis_calib.solver import LineStatistics, Problem, SolverSettings, solve
 from rmis_calib.solver.initialise import find_candidates
-from tests.benchmarks.bench_solver_common import KNOWN_RADIUS, REALISTIC, config, errors, median_seconds, rotation_deg, study, translation_mm
+from tests.benchmarks.bench_solver_common import (
+    KNOWN_RADIUS,
+    REALISTIC,
+    config,
+    errors,
+    median_seconds,
+    rotation_deg,
+    study,
+    translation_mm,
+)
 
 
 def scipy_joint(problem: Problem, start: np.ndarray, end_offset: float) -> np.ndarray:
-    """The same weighted joint estimate by SciPy: a plain user's residual function in NumPy, with latent poses eliminated by whitening with the noise at the start.
+    """The same weighted joint estimate by SciPy: a plain user's residual function in NumPy, with latent poses
+    eliminated by whitening with the noise at the start.
 
-    Twelve shared unknowns and the end offset; residuals of both contours, ends, both cameras; Jacobian by finite differences, as by default.
+    Twelve shared unknowns and the end offset; residuals of both contours, ends, both cameras; Jacobian by finite
+    differences, as by default.
     """
-    P = {f.name: getattr(problem, f.name)[0].numpy() for f in fields(problem) if isinstance(getattr(problem, f.name), torch.Tensor) and getattr(problem, f.name).ndim > 1}
+    P = {
+        f.name: getattr(problem, f.name)[0].numpy()
+        for f in fields(problem)
+        if isinstance(getattr(problem, f.name), torch.Tensor) and getattr(problem, f.name).ndim > 1
+    }
     radius = float(problem.radius_mm[0])
     noise = {f.name: float(getattr(problem.noise, f.name)[0]) for f in fields(problem.noise)}
     Z0 = P["camera_T_camera_right"][1]

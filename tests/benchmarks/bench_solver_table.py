@@ -1,4 +1,5 @@
-"""The table of the design, in the independent simulation: where `paper` collapses, where `global` is biased, and the bound.
+"""The table of the design, in the independent simulation: where `paper` collapses, where `global` is biased, and the
+bound.
 
     python tests/benchmarks/bench_solver_table.py [--trials 20]
 
@@ -30,10 +31,16 @@ def main() -> int:
     parser.add_argument("--range-mm", type=float, default=20.0)
     args = parser.parse_args()
     settings = SolverSettings(unknowns=KNOWN_RADIUS)
-    print(f"deg / mm, median [rmse] of {args.trials} trials, axis lines, stereo; paper: trials off by more than 20 deg in brackets")
-    print(f"{'noise':30} | {'paper':32} | {'global':30} | {'joint':30} | {'bound':15} | joint with contours and ends (bound)")
+    print(
+        f"deg / mm, median [rmse] of {args.trials} trials, axis lines, stereo; paper: trials off by more than 20 deg in brackets"
+    )
+    print(
+        f"{'noise':30} | {'paper':32} | {'global':30} | {'joint':30} | {'bound':15} | joint with contours and ends (bound)"
+    )
     for name, noise in ROWS:
-        settings_of = config(noise, args.trials, 7, rotation_range_deg=args.range_deg, translation_range_mm=args.range_mm)
+        settings_of = config(
+            noise, args.trials, 7, rotation_range_deg=args.range_deg, translation_range_mm=args.range_mm
+        )
         trial = study(settings_of, ("axis",))
         cells = []
         for method in ("paper", "global", "joint"):
@@ -44,7 +51,9 @@ def main() -> int:
         more = study(settings_of, ("contours", "ends"))
         e = errors(solve(more.problem, settings).camera_right_T_arm, more.truth)
         cells.append(f"{trial.bound_deg:.3f} / {trial.bound_mm:.3f}")
-        cells.append(f"[{rms(rotation_deg(e)):.3f} / {rms(translation_mm(e)):.3f}] ({more.bound_deg:.3f} / {more.bound_mm:.3f})")
+        cells.append(
+            f"[{rms(rotation_deg(e)):.3f} / {rms(translation_mm(e)):.3f}] ({more.bound_deg:.3f} / {more.bound_mm:.3f})"
+        )
         print(f"{name:30} | {cells[0]:32} | {cells[1]:30} | {cells[2]:30} | {cells[3]:15} | {cells[4]}", flush=True)
     return 0
 

@@ -1,4 +1,5 @@
-"""Degenerate and hostile input: each case ends in a named error, a named status or an honest verdict, never in a confident wrong number."""
+"""Degenerate and hostile input: each case ends in a named error, a named status or an honest verdict, never in a
+confident wrong number."""
 
 from dataclasses import replace
 
@@ -13,11 +14,19 @@ from rmis_calib.geometry.rotations import rotation_angle
 from rmis_calib.solver import Problem, SolverSettings, SolveStatus, Verdict, solve
 from rmis_calib.solver.observability import VERDICTS, Degeneracy
 
-REALISTIC = {"pixel_noise_px": 0.3, "kinematics_noise_mm": 0.3, "kinematics_noise_deg": 0.1, "stereo_noise_mm": 0.05, "stereo_noise_deg": 0.05}
+REALISTIC = {
+    "pixel_noise_px": 0.3,
+    "kinematics_noise_mm": 0.3,
+    "kinematics_noise_deg": 0.1,
+    "stereo_noise_mm": 0.05,
+    "stereo_noise_deg": 0.05,
+}
 
 
 def arrays(**fields):
-    return simulate_lines(LineStudyConfig(**({"trials": 1, "positions_laparoscope": 1, "positions_instrument": 5} | REALISTIC | fields)))
+    return simulate_lines(
+        LineStudyConfig(**({"trials": 1, "positions_laparoscope": 1, "positions_instrument": 5} | REALISTIC | fields))
+    )
 
 
 def problem_of(data, *kinds, cameras=2):
@@ -32,7 +41,9 @@ def is_honest(solution, data, factor=4.0):
     T = solution.camera_right_T_arm
     degrees = torch.rad2deg(rotation_angle(T[..., :3, :3] @ X[..., :3, :3].mT))
     mm = torch.linalg.vector_norm(T[..., :3, 3] - X[..., :3, 3], dim=-1)
-    return bool((degrees < factor * solution.rotation_sigma_deg).all()) and bool((mm < factor * solution.translation_sigma_mm).all())
+    return bool((degrees < factor * solution.rotation_sigma_deg).all()) and bool(
+        (mm < factor * solution.translation_sigma_mm).all()
+    )
 
 
 @pytest.mark.parametrize("method", ["paper", "global", "joint"])
@@ -64,7 +75,9 @@ def one_joint(data, joint):
     """Only the motions in which a single instrument joint leaves the middle of its range."""
     grid = np.stack(np.meshgrid(*[np.arange(5)] * 3, indexing="ij"), -1).reshape(-1, 3)
     keep = np.all(np.delete(grid, joint, 1) == 2, axis=1)
-    return {k: v[:, keep] if isinstance(v, np.ndarray) and v.ndim > 1 and v.shape[1] == 125 else v for k, v in data.items()}
+    return {
+        k: v[:, keep] if isinstance(v, np.ndarray) and v.ndim > 1 and v.shape[1] == 125 else v for k, v in data.items()
+    }
 
 
 @pytest.mark.parametrize("kinds", [("axis",), ("contours", "ends")])
@@ -90,7 +103,9 @@ def test_motions_in_one_plane_are_recognised():
     normal = torch.linalg.cross(torch.linalg.cross(centre / centre.norm(), normal), centre / centre.norm())
     normal = normal / normal.norm()
     planar = v - (v @ normal)[:, None] * normal
-    problem = replace(problem_of(data, "contours", "ends", cameras=1), rcm_v_axis=(planar / planar.norm(dim=-1, keepdim=True))[None])
+    problem = replace(
+        problem_of(data, "contours", "ends", cameras=1), rcm_v_axis=(planar / planar.norm(dim=-1, keepdim=True))[None]
+    )
     flags = solve(problem, SolverSettings(robust="off")).observability().degeneracies
     assert "ONE_PLANE" in flags
 
@@ -101,7 +116,10 @@ def test_short_baseline_is_recognised():
     shorter["camera_left_T_camera_right"] = data["camera_left_T_camera_right"].copy()
     shorter["camera_left_T_camera_right"][..., :3, 3] *= 0.01
     assert int(solve(problem_of(shorter, "axis"), method="global").sight.degeneracy[0]) & Degeneracy.SHORT_BASELINE
-    assert not int(solve(problem_of(arrays(positions_laparoscope=2), "axis"), method="global").sight.degeneracy[0]) & Degeneracy.STATIC_LAPAROSCOPE
+    assert (
+        not int(solve(problem_of(arrays(positions_laparoscope=2), "axis"), method="global").sight.degeneracy[0])
+        & Degeneracy.STATIC_LAPAROSCOPE
+    )
 
 
 def test_lines_of_somebody_else_are_not_fitted():
@@ -139,7 +157,11 @@ def test_metres_for_millimetres_do_not_pass():
 def test_frozen_joints_are_rejected():
     """A third of the motions repeats the pose of the first one although the pictures move on."""
     data = arrays(positions_laparoscope=2, positions_instrument=3)
-    frozen = dict(data) | {"arm_T_rcm": data["arm_T_rcm"].copy(), "rcm_v_axis": data["rcm_v_axis"].copy(), "rcm_s_end_mm": data["rcm_s_end_mm"].copy()}
+    frozen = dict(data) | {
+        "arm_T_rcm": data["arm_T_rcm"].copy(),
+        "rcm_v_axis": data["rcm_v_axis"].copy(),
+        "rcm_s_end_mm": data["rcm_s_end_mm"].copy(),
+    }
     for key in ("arm_T_rcm", "rcm_v_axis", "rcm_s_end_mm"):
         frozen[key][:, 72:144] = data[key][:, 72:73]
     solution = solve(problem_of(frozen, "contours", "ends"))
@@ -150,7 +172,10 @@ def test_frozen_joints_are_rejected():
 
 
 def test_too_few_motions():
-    data = {k: v[:, :2] if isinstance(v, np.ndarray) and v.ndim > 1 and v.shape[1] == 125 else v for k, v in arrays().items()}
+    data = {
+        k: v[:, :2] if isinstance(v, np.ndarray) and v.ndim > 1 and v.shape[1] == 125 else v
+        for k, v in arrays().items()
+    }
     with pytest.raises(InsufficientDataError, match="at least 3 motions"):
         Problem.from_arrays(data)
 
@@ -188,7 +213,9 @@ def test_impossible_values_are_named(change, message):
 
 def test_a_few_motions_give_a_large_sigma_not_a_wrong_answer():
     data = arrays(trials=6, positions_laparoscope=2, positions_instrument=3)
-    few = {k: v[:, ::50] if isinstance(v, np.ndarray) and v.ndim > 1 and v.shape[1] == 216 else v for k, v in data.items()}
+    few = {
+        k: v[:, ::50] if isinstance(v, np.ndarray) and v.ndim > 1 and v.shape[1] == 216 else v for k, v in data.items()
+    }
     solution = solve(problem_of(few, "contours", "ends"))  # 5 motions
     X = torch.as_tensor(data["truth"]["camera_right_T_arm"])
     mm = torch.linalg.vector_norm(solution.camera_right_T_arm[:, :3, 3] - X[:, :3, 3], dim=-1)

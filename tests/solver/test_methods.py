@@ -17,14 +17,18 @@ EXACT = UnknownSettings(radius_sigma_relative=0.0)
 def error(solution, truth):
     X = torch.as_tensor(truth["camera_right_T_arm"])
     T = solution.camera_right_T_arm
-    return torch.rad2deg(rotation_angle(T[..., :3, :3] @ X[..., :3, :3].mT)), torch.linalg.vector_norm(T[..., :3, 3] - X[..., :3, 3], dim=-1)
+    return torch.rad2deg(rotation_angle(T[..., :3, :3] @ X[..., :3, :3].mT)), torch.linalg.vector_norm(
+        T[..., :3, 3] - X[..., :3, 3], dim=-1
+    )
 
 
 @pytest.mark.parametrize("method", ["paper", "global", "joint"])
 @pytest.mark.parametrize("random_hand_eye", [False, True])
 def test_exact_lines_give_the_exact_transform(simulate, method, random_hand_eye):
     problem, truth, _ = simulate(trials=4, random_hand_eye=random_hand_eye)
-    solution = solve(problem, SolverSettings(unknowns=EXACT, noise=NoiseSettings(estimate="never"), bias_correction=False), method)
+    solution = solve(
+        problem, SolverSettings(unknowns=EXACT, noise=NoiseSettings(estimate="never"), bias_correction=False), method
+    )
     degrees, mm = error(solution, truth)
     assert solution.status.tolist() == [SolveStatus.CONVERGED] * 4
     assert float(degrees.max()) < 1e-5  # quaternion and score tolerances; data exact to 1e-15
@@ -83,7 +87,9 @@ def test_same_seed_same_result(simulate, realistic):
 @pytest.mark.slow
 def test_bias_correction_removes_the_errors_in_variables_bias(simulate):
     """At c = 1 the plain estimate is off by the same 0.5 mm in every trial (DESIGN.md, section 3)."""
-    problem, truth, _ = simulate(trials=24, positions_laparoscope=3, pixel_noise_px=0.5, kinematics_noise_mm=1.0, kinematics_noise_deg=1.0)
+    problem, truth, _ = simulate(
+        trials=24, positions_laparoscope=3, pixel_noise_px=0.5, kinematics_noise_mm=1.0, kinematics_noise_deg=1.0
+    )
     problem = problem.only("axis")
     X = torch.as_tensor(truth["camera_right_T_arm"])[:, :3, 3]
     mean_error, sigma = {}, {}

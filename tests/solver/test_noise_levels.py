@@ -85,7 +85,9 @@ def test_one_wrong_line_is_named_and_does_no_harm(simulate, realistic):
 
 def test_expected_score_equals_brute_force(simulate):
     """Antithetic pairs against plain simulation with 60 times as many draws."""
-    problem, _, _ = simulate(trials=1, positions_instrument=2, pixel_noise_px=0.3, kinematics_noise_mm=1.0, kinematics_noise_deg=1.0)
+    problem, _, _ = simulate(
+        trials=1, positions_instrument=2, pixel_noise_px=0.3, kinematics_noise_mm=1.0, kinematics_noise_deg=1.0
+    )
     fit = solve_joint(problem.only("axis"), SolverSettings(bias_correction=False))
     pairs = expected_score(fit.packed, fit.state, fit.layout, fit.noise, 64 * 60, 4096, seed=0)
     again = expected_score(fit.packed, fit.state, fit.layout, fit.noise, 64 * 60, 4096, seed=1)
@@ -96,7 +98,9 @@ def test_expected_score_equals_brute_force(simulate):
 
 def test_noise_free_scores_have_no_bias(simulate):
     problem, _, _ = simulate(trials=1, positions_instrument=2)
-    fit = solve_joint(problem.only("axis"), SolverSettings(noise=NoiseSettings(estimate="never"), bias_correction=False))
+    fit = solve_joint(
+        problem.only("axis"), SolverSettings(noise=NoiseSettings(estimate="never"), bias_correction=False)
+    )
     quiet = replace(fit.noise, **{name: value * 0.0 for name, value in vars(fit.noise).items() if "_" in name})
     score = expected_score(fit.packed, fit.state, fit.layout, quiet, 64, 4096, seed=0)
     sigma = torch.linalg.inv(fit.covariance[0, :6, :6]).diagonal().sqrt()

@@ -30,7 +30,9 @@ def test_clock_offset_is_found(clock_s):
     candidates = torch.arange(-3.0, 3.01, 0.1, dtype=torch.float64)
     found, _ = scan_clock(recorded.kinematics, 6, candidates)
     assert found == pytest.approx(clock_s, abs=0.11)
-    solution = solve(kinematics(ZERO, STILL + found), SolverSettings(unknowns=replace(KNOWN, clock=True)), kinematics=kinematics)
+    solution = solve(
+        kinematics(ZERO, STILL + found), SolverSettings(unknowns=replace(KNOWN, clock=True)), kinematics=kinematics
+    )
     clock = solution.nuisances["clock"]
     assert float(clock.value) == pytest.approx(clock_s, abs=4.0 * float(clock.sigma))
     assert float(clock.sigma) < 0.005

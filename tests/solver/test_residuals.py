@@ -27,12 +27,22 @@ def scene(simulate):
     head = problem.rcm_p_head + torch.tensor([3.0, -2.0, 0.5])  # off the axis, so that turning about it shows
     one = torch.full((1,), 0.05, dtype=torch.float64)  # an exact stereo pair would not be refined
     problem = replace(
-        problem, noise=replace(problem.noise, stereo_mm=one, stereo_rad=one), joint_derivative=joint, clock_derivative=clock, joint_offset_sigma=torch.ones(1, 2, dtype=torch.float64), rcm_p_head=head
+        problem,
+        noise=replace(problem.noise, stereo_mm=one, stereo_rad=one),
+        joint_derivative=joint,
+        clock_derivative=clock,
+        joint_offset_sigma=torch.ones(1, 2, dtype=torch.float64),
+        rcm_p_head=head,
     )
     X = torch.as_tensor(truth["camera_right_T_arm"])
     packed = pack(problem, SolverSettings().noise)
     state = initial_state(Nominal.of(problem), X[:, :3, :3], X[:, :3, 3])
-    return problem, packed, replace(state, end_offset=torch.full((1,), truth["shaft_end_offset_mm"], dtype=torch.float64)), truth
+    return (
+        problem,
+        packed,
+        replace(state, end_offset=torch.full((1,), truth["shaft_end_offset_mm"], dtype=torch.float64)),
+        truth,
+    )
 
 
 def test_exact_measurements_have_no_residual(simulate):
@@ -40,16 +50,23 @@ def test_exact_measurements_have_no_residual(simulate):
     X = torch.as_tensor(truth["camera_right_T_arm"])
     packed = pack(problem, SolverSettings().noise)
     state = replace(
-        initial_state(Nominal.of(problem), X[:, :3, :3], X[:, :3, 3]), end_offset=torch.full((1,), truth["shaft_end_offset_mm"], dtype=torch.float64)
+        initial_state(Nominal.of(problem), X[:, :3, :3], X[:, :3, 3]),
+        end_offset=torch.full((1,), truth["shaft_end_offset_mm"], dtype=torch.float64),
     )
     assert packed.row_kind == (LINE,) * 8 + (END,) * 2 + (HEAD,) * 4
     assert float(residual_rows(packed, state).abs().max()) < 1e-12
 
 
 def test_line_residual_is_distance_to_contour(scene):
-    """Against geometry.lines: the signed distance of the measured point from the line that the contour plane cuts out of the image."""
+    """Against geometry.lines: the signed distance of the measured point from the line that the contour plane cuts out
+    of the image."""
     problem, packed, state, _ = scene
-    moved = state.moved({"rotation": torch.full((1, 3), 0.01, dtype=torch.float64), "translation": torch.full((1, 3), 0.5, dtype=torch.float64)})
+    moved = state.moved(
+        {
+            "rotation": torch.full((1, 3), 0.01, dtype=torch.float64),
+            "translation": torch.full((1, 3), 0.5, dtype=torch.float64),
+        }
+    )
     A = problem.arm_T_rcm[0]
     p = (moved.R[0] @ A[:, :3, 3].T).T + moved.t[0]
     v = (moved.R[0] @ (A[:, :3, :3] @ problem.rcm_v_axis[0][..., None])[..., 0].T).T
@@ -64,8 +81,9 @@ def test_line_residual_is_distance_to_contour(scene):
 
 
 def test_hand_derived_line_residual():
-    """A shaft along +x, 100 mm in front of the camera, radius 4: contours at y = -+ 4/sqrt(100^2 - 4^2); a point 0.01 below the upper edge
-    (edge 0, y down) is at residual +0.01, and dz of the camera's arm by 1 mm towards the far side narrows the edges by about 4/100^2."""
+    """A shaft along +x, 100 mm in front of the camera, radius 4: contours at y = -+ 4/sqrt(100^2 - 4^2); a point 0.01
+    below the upper edge (edge 0, y down) is at residual +0.01, and dz of the camera's arm by 1 mm towards the far side
+    narrows the edges by about 4/100^2."""
     edge = 4.0 / np.sqrt(100.0**2 - 16.0)
     contour = np.array([[[-0.2, -edge + 0.01], [0.3, -edge + 0.01]], [[-0.2, edge], [0.3, edge]]])
     arrays = {
@@ -74,11 +92,17 @@ def test_hand_derived_line_residual():
     }  # fmt: skip
     problem = Problem.from_arrays(arrays).flatten_batch()
     packed = pack(problem, SolverSettings().noise)
-    state = initial_state(Nominal.of(problem), torch.eye(3, dtype=torch.float64)[None], torch.tensor([[-30.0, 0.0, 100.0]], dtype=torch.float64))
+    state = initial_state(
+        Nominal.of(problem),
+        torch.eye(3, dtype=torch.float64)[None],
+        torch.tensor([[-30.0, 0.0, 100.0]], dtype=torch.float64),
+    )
     assert residual_rows(packed, state)[:, 0, 0].tolist() == pytest.approx([0.01, 0.01, 0.0, 0.0], abs=1e-12)
     rows, _ = linearise(packed, state)
     slope = 100.0 * 4.0 / (100.0**2 - 16.0) ** 1.5  # d(edge)/dz
-    assert rows.w[2, :, 0, 0].tolist() == pytest.approx([-slope, -slope, slope, slope], rel=1e-3)  # the counter-sign would say that shafts grow with distance
+    assert rows.w[2, :, 0, 0].tolist() == pytest.approx(
+        [-slope, -slope, slope, slope], rel=1e-3
+    )  # the counter-sign would say that shafts grow with distance
 
 
 def test_jacobian_of_every_unknown_equals_autodiff(scene):
@@ -140,5 +164,7 @@ def test_absent_measurements_have_zero_rows(simulate):
 
 def test_edges_are_put_into_canonical_order(simulate):
     problem, _, arrays = simulate(trials=1)
-    swapped = dict(arrays) | {f"contour_{side}": arrays[f"contour_{side}"][:, :, ::-1].copy() for side in ("right", "left")}
+    swapped = dict(arrays) | {
+        f"contour_{side}": arrays[f"contour_{side}"][:, :, ::-1].copy() for side in ("right", "left")
+    }
     torch.testing.assert_close(Problem.from_arrays(swapped).contour_xy, problem.contour_xy, equal_nan=True)

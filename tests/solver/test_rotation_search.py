@@ -3,7 +3,15 @@
 import torch
 
 from rmis_calib.geometry.rotations import quat_to_matrix, random_quat, rotation_angle, rotvec_to_matrix
-from rmis_calib.solver.rotation_search import derivatives, distinct_minima, rotation_cost, rotation_grid, search_rotations, unvec, vec
+from rmis_calib.solver.rotation_search import (
+    derivatives,
+    distinct_minima,
+    rotation_cost,
+    rotation_grid,
+    search_rotations,
+    unvec,
+    vec,
+)
 
 
 def random_gram(seed=0, batch=3):
@@ -43,11 +51,14 @@ def test_grid_covers_all_rotations():
 
 
 def test_known_minimum_is_found_from_anywhere():
-    """vec(R)^T M vec(R) with M = sum of kron(v, n) rows of an exact rotation has its zero there, whatever the rotation."""
+    """vec(R)^T M vec(R) with M = sum of kron(v, n) rows of an exact rotation has its zero there, whatever the
+    rotation."""
     generator = torch.Generator().manual_seed(3)
     R = quat_to_matrix(random_quat((32,), generator=generator, dtype=torch.float64))
     v = torch.nn.functional.normalize(torch.randn(32, 40, 3, generator=generator, dtype=torch.float64), dim=-1)
-    n = torch.nn.functional.normalize(torch.linalg.cross(v @ R.mT, torch.randn(32, 40, 3, generator=generator, dtype=torch.float64)), dim=-1)
+    n = torch.nn.functional.normalize(
+        torch.linalg.cross(v @ R.mT, torch.randn(32, 40, 3, generator=generator, dtype=torch.float64)), dim=-1
+    )
     rows = (v[..., :, None] * n[..., None, :]).flatten(-2)
     found, cost = search_rotations(rows.mT @ rows, 576, 4)
     assert float(cost[:, 0].max()) < 1e-12

@@ -1,0 +1,201 @@
+"""Estimates made into solutions: status, reasons, covariance, nuisances, observability and residuals."""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from rmis_calib.geometry.rigid import rigid_from_rotation_translation
+from rmis_calib.solver.competition import cheirality
+from rmis_calib.solver.initialise import COLLAPSED_MM, collapsed
+from rmis_calib.solver.joint import JointFit
+from rmis_calib.solver.measurements import END, HEAD, LINE, Packed, pack
+from rmis_calib.solver.normal import NoiseModel, accumulate
+from rmis_calib.solver.observability import Degeneracy, look, recognise
+from rmis_calib.solver.problem import Problem
+from rmis_calib.solver.residuals import State, residual_rows
+from rmis_calib.solver.robust import REJECTED
+from rmis_calib.solver.settings import SolverSettings, UnknownSettings
+from rmis_calib.solver.solution import MotionReason, Nuisance, Sight, Solution, SolveStatus
+from rmis_calib.solver.unknowns import TRANSLATION_SIGMA_MM, UNITS, Nominal, initial_state, make_layout
+from rmis_calib.solver.variance import COMPONENTS, assumed_noise
+
+MIN_CHEIRALITY = 0.5
+CHECKED_MOTIONS = 256
+MAX_CHI2_PER_DOF = 3.0
+"""Past this the model is wrong (swapped cameras, another rig), and no larger noise level makes it right."""
+SHOWN_MOTIONS = 4096
+"""Motions from which the degenerate cases are recognised, and on which the scatter of the two-step methods is
+measured; longer recordings are sampled evenly."""
+
+
+def two_step_solution(
+    flat: Problem, R: Tensor, t: Tensor, covariance: Tensor, settings: SolverSettings, method: str
+) -> Solution:
+    """Solution of `paper` and `global`, which use the axis lines alone."""
+    axis_only = flat.only("axis")
+    covariance = covariance + _unseen_depth(flat, R, t)
+    packed = pack(axis_only, settings.noise)
+    noise, _ = assumed_noise(flat, settings.noise)
+    state = initial_state(Nominal.of(axis_only), R, t)
+    front = cheirality(packed, state, torch.ones_like(packed.line_ok[0]))
+    status = torch.where(front < MIN_CHEIRALITY, SolveStatus.BEHIND_CAMERA, SolveStatus.CONVERGED)
+    status = torch.where(
+        torch.isfinite(covariance).all(-1).all(-1) & torch.isfinite(t).all(-1), status, SolveStatus.NON_FINITE
+    )
+    seen = packed.line_ok.any(0).any(0)
+    excess = _chi2_per_dof(axis_only, state, noise, settings)
+    status = torch.where((excess > MAX_CHI2_PER_DOF) & (status == SolveStatus.CONVERGED), SolveStatus.MISFIT, status)
+    sight = _sight(axis_only, R, t, covariance, noise, (False, False, False), settings)
+    static = (sight.degeneracy & Degeneracy.STATIC_LAPAROSCOPE) > 0
+    # A two-step estimate from a laparoscope that stands still is biased by more than its scatter shows (DESIGN.md,
+    # section 3).
+    sight = replace(sight, verdict=torch.where(static, sight.verdict.clamp_min(1), sight.verdict))
+    return Solution(
+        method=method,
+        camera_right_T_arm=rigid_from_rotation_translation(R, t),
+        camera_left_T_camera_right=flat.camera_T_camera_right[:, 1] if flat.n_cameras == 2 else None,
+        covariance=covariance,
+        status=status,
+        cheirality=front,
+        iterations=torch.zeros_like(status),
+        chi2_per_dof=excess,
+        distance=torch.full_like(seen, torch.nan, dtype=t.dtype),
+        reason=torch.where(seen, MotionReason.USED, MotionReason.NOT_MEASURED),
+        noise={},
+        nuisances={},
+        bias=torch.zeros_like(covariance[..., 0]),
+        sight=sight,
+        residual_lines=_rms(packed, state, LINE),
+        residual_ends=_rms(packed, state, END),
+        residual_heads=_rms(packed, state, HEAD),
+    )
+
+
+def _chi2_per_dof(problem: Problem, state: State, noise: NoiseModel, settings: SolverSettings) -> Float[Tensor, " b"]:
+    """Weighted squared residuals over degrees of freedom, on a few hundred motions: a fit in the wrong basin shows
+    here where the cheirality does not."""
+    part = problem.select_motions(slice(None, None, max(1, problem.n_motions // CHECKED_MOTIONS)))
+    packed = pack(part, settings.noise)
+    layout = make_layout(Nominal.of(part), packed, state, UnknownSettings(stereo=False), settings.noise)
+    normal = accumulate(packed, state, layout, noise, settings.chunk)
+    prior = layout.prior(state)
+    return (normal.chi2 - (prior[0].square() * prior[1]).sum(-1)) / (normal.rows - 6.0).clamp_min(1.0)
+
+
+def _unseen_depth(flat: Problem, R: Tensor, t: Tensor) -> Float[Tensor, "b 6 6"]:
+    """Variance along the ray of the RCM where the lines of one camera do not tell its distance; zero elsewhere."""
+    p = flat.arm_T_rcm[..., :3, 3] @ R.mT + t[:, None]
+    centred = p - p.mean(-2, keepdim=True)
+    nearly_static = centred.norm(dim=-1).mean(-1) < COLLAPSED_MM
+    unseen = collapsed(p) | (nearly_static if flat.n_cameras == 1 else torch.zeros_like(nearly_static))
+    ray = torch.nn.functional.normalize(p.mean(-2), dim=-1)
+    block = TRANSLATION_SIGMA_MM**2 * ray[:, :, None] * ray[:, None]
+    return torch.nn.functional.pad(torch.where(unseen[:, None, None], block, 0.0), (3, 0, 3, 0))
+
+
+def joint_solution(fit: JointFit, settings: SolverSettings) -> Solution:
+    """Solution of the joint estimate."""
+    packed, state = fit.packed, fit.state
+    C = fit.covariance[:, :6, :6]
+    status, reason, excess = _judge(fit)
+    C = C * excess.clamp_min(1.0)[:, None, None]  # too small noise levels would make sigma too small (Birge 1932)
+    distance = (fit.distance2 / packed.rows_ok.sum(0).clamp_min(1)).sqrt()
+    uses = (packed.has_contours, packed.has_ends, packed.has_heads)
+    left = rigid_from_rotation_translation(state.stereo_R, state.stereo_t) if packed.cameras == 2 else None
+    return Solution(
+        method="joint",
+        camera_right_T_arm=rigid_from_rotation_translation(state.R, state.t),
+        camera_left_T_camera_right=left,
+        covariance=C,
+        status=status,
+        cheirality=fit.cheirality,
+        iterations=fit.steps,
+        chi2_per_dof=excess,
+        distance=torch.where(packed.rows_ok.any(0), distance, torch.nan),
+        reason=reason,
+        noise={name: getattr(fit.noise, name).sqrt() for name in COMPONENTS},
+        nuisances=_nuisances(fit, settings),
+        bias=fit.bias[:, :6],
+        history=fit.history,
+        sight=_sight(fit.problem, state.R, state.t, C, fit.noise, uses, settings),
+        residual_lines=_rms(packed, state, LINE),
+        residual_ends=_rms(packed, state, END),
+        residual_heads=_rms(packed, state, HEAD),
+    )
+
+
+def _judge(fit: JointFit) -> tuple[Int[Tensor, " b"], Int[Tensor, "b n"], Float[Tensor, " b"]]:
+    """Status, what became of each motion, and chi^2 per degree of freedom."""
+    packed, used = fit.packed, fit.weight > REJECTED
+    cameras = torch.tensor(packed.row_camera, device=used.device)
+    measured = torch.stack([packed.rows_ok[cameras == c].any(0) for c in range(packed.cameras)])
+    good = (used & measured).any(0)
+    reason = torch.where(good, MotionReason.USED, MotionReason.OUTLIER)
+    reason = torch.where(good & (measured & ~used).any(0), MotionReason.OUTLIER_ONE_CAMERA, reason)
+    reason = torch.where(measured.any(0), reason, MotionReason.NOT_MEASURED)
+    kept = (used & measured).sum((0, 2)) / measured.sum((0, 2)).clamp_min(1)
+    excess = fit.chi2 / (packed.keep(used).rows_ok.sum((0, 2)) - 6.0).clamp_min(1.0)
+    status = fit.status
+    for wrong, code in (
+        (fit.cheirality < MIN_CHEIRALITY, SolveStatus.BEHIND_CAMERA),
+        (kept < 0.5, SolveStatus.INCONSISTENT),
+        (excess > MAX_CHI2_PER_DOF, SolveStatus.MISFIT),
+    ):
+        status = torch.where(wrong & (status == SolveStatus.CONVERGED), code, status)
+    return status, reason, excess
+
+
+def _nuisances(fit: JointFit, settings: SolverSettings) -> dict[str, Nuisance]:
+    """Every estimated unknown beside the transform."""
+    deviation, _ = fit.layout.prior(fit.state)
+    sigma = fit.covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
+    out = {}
+    for name, part in fit.layout.blocks.items():
+        if name in ("rotation", "translation"):
+            continue
+        value = fit.state.radius[:, None] if name == "radius" else deviation[:, part]
+        held = sigma[:, part] > settings.unknowns.held_ratio * fit.layout.sigma[:, part]
+        out[name] = Nuisance(
+            value=value,
+            sigma=sigma[:, part],
+            unit=UNITS[name],
+            held=held,
+            pull=deviation[:, part] / fit.layout.sigma[:, part],
+        )
+    return out
+
+
+def _sight(
+    problem: Problem,
+    R: Tensor,
+    t: Tensor,
+    C: Tensor,
+    noise: NoiseModel,
+    uses: tuple[bool, bool, bool],
+    settings: SolverSettings,
+) -> Sight:
+    if problem.n_motions > SHOWN_MOTIONS:
+        problem = problem.select_motions(slice(None, None, problem.n_motions // SHOWN_MOTIONS))
+    first = look(problem, R, t, C, settings.verdict, torch.zeros_like(t[:, 0], dtype=torch.int64))
+    distance = torch.linalg.vector_norm(first.working_point_mm, dim=-1)
+    flags = recognise(problem, noise.kinematics_mm.sqrt(), noise.kinematics_rad.sqrt(), uses, settings.noise, distance)
+    return replace(first, degeneracy=flags)
+
+
+def _rms(packed: Packed, state: State, kind: int) -> Float[Tensor, "b c n"]:
+    """Root mean square of one kind, per camera and motion; a long recording in parts. NaN where not measured."""
+    step = max(1, 8 * SHOWN_MOTIONS // packed.trials)
+    kinds, cameras = torch.tensor(packed.row_kind), torch.tensor(packed.row_camera)
+    parts = []
+    for n in range(0, packed.motions, step):
+        part = packed.narrow(slice(None), slice(n, n + step))
+        r, ok = residual_rows(part, state), part.rows_ok
+        per_camera = []
+        for c in range(packed.cameras):
+            rows = torch.nonzero((kinds == kind) & (cameras == c))[:, 0].to(r.device)
+            count = ok[rows].sum(0)
+            per_camera.append(torch.where(count > 0, (r[rows].square().sum(0) / count.clamp_min(1)).sqrt(), torch.nan))
+        parts.append(torch.stack(per_camera, dim=1))
+    return torch.cat(parts, dim=-1)
