@@ -18,7 +18,7 @@ from rmis_calib.solver.relinearise import scan_clock
 from rmis_calib.solver.solution import MotionReason, Observability
 
 COARSE_CLOCK_STEP_S, CLOCK_STEP_S = 0.1, 0.02
-"""Spacing of the clock offsets that are tried, first everywhere, then near the best: surgical motion hardly turns within
+"""Spacing of the clock offsets that are tried, first everywhere, then near the best: motion hardly turns within
 0.1 s, and motion within 0.02 s stays inside one linearisation."""
 CLEARLY_BETTER = 0.5
 """Part of the disagreement at the recording's own clock below which another clock offset is believed. A camera that

@@ -1,0 +1,108 @@
+"""Joint and clock offsets: derivatives against finite displacements, and recovery of what the generator put in."""
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+import data_synth
+import rmis_calib as rc
+from rmis_calib.config import parse_config
+from rmis_calib.geometry.rigid import rigid_inverse
+from rmis_calib.geometry.rotations import matrix_to_rotvec
+from rmis_calib.pipeline.estimation import estimate_with_kinematics
+from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
+from rmis_calib.pipeline.poses import motion_poses
+
+CLOCK_S = 0.72
+SMALL = {"fx_px": 175.0, "fy_px": 175.0, "cx_px": 80.0, "cy_px": 60.0, "distortion": [0.0] * 5}
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory):
+    """A continuous recording, its joints on a clock 0.72 s from the pictures'; small pictures: only truth is used."""
+    path = tmp_path_factory.mktemp("moving") / "recording"
+    config = {
+        "motions": 240,
+        "seed": 8,
+        "camera": {"width_px": 160, "height_px": 120, "right": SMALL, "left": None},
+        "motion": {"kind": "smooth", "frame_rate_hz": 20.0, "joint_rate_hz": 100.0},
+        "noise": {"kinematics_mm": 0.0, "kinematics_deg": 0.0, "clock_offset_s": CLOCK_S, "joint_offset_deg": 0.3},
+    }
+    data_synth.write_recording(path, data_synth.load_synth_config(config))
+    return path
+
+
+def observations_from_truth(path, recording, poses, sigma_px=0.05):
+    """What a detector with this noise would measure, from truth.npz."""
+    truth = np.load(path / "truth.npz")
+    generator = np.random.default_rng(0)
+    sigma = sigma_px / float(recording.stereo.right.focal)
+    arrays = {}
+    for key in ("axis", "contour", "end"):
+        values = truth[f"right_{key}_xy"][poses.frames]
+        arrays[f"{key}_right"] = values + sigma * generator.standard_normal(values.shape)
+    return rc.ShaftObservations(
+        arm_T_rcm=poses.arm_T_rcm.numpy(),
+        rcm_v_axis=poses.rcm_v_axis.numpy(),
+        rcm_s_end_mm=poses.rcm_s_end_mm.numpy(),
+        shaft_radius_mm=recording.shaft_diameter_mm / 2,
+        sigma_image=sigma,
+        **arrays,
+    )
+
+
+def test_derivative_is_the_displacement_of_the_shaft(moving):
+    recording = rc.load_recording(moving)
+    poses = motion_poses(recording)
+    unknowns = KinematicUnknowns(recording, poses.frames, "cpu")
+    problem = rc_problem(observations_from_truth(moving, recording, poses))
+    sigma = unknowns.prior_sigma(parse_config({}).solver.unknowns)
+    zero = torch.zeros(1, len(sigma), dtype=torch.float64)
+    here = unknowns.linearised(problem, zero, torch.zeros(1, dtype=torch.float64), sigma)
+    for joint in range(len(sigma)):
+        step = 1e-4 * torch.eye(len(sigma), dtype=torch.float64)[joint]
+        there = unknowns.motion_poses(poses.frames, step, 0.0)
+        T, moved = here.arm_T_rcm[0], there.arm_T_rcm
+        omega = matrix_to_rotvec((rigid_inverse(T) @ moved)[:, :3, :3])
+        shift = (T[:, :3, :3].mT @ (moved - T)[:, :3, 3:])[..., 0]
+        v = here.rcm_v_axis[0]
+        omega = omega + torch.linalg.cross(v, there.rcm_v_axis - v)
+        shift = shift + v * (there.rcm_s_end_mm - here.rcm_s_end_mm[0])[:, None]
+        expected = torch.cat([omega, shift], dim=-1) / 1e-4
+        # A forward difference is wrong by step times half the second derivative: 1e-4 of the size of the displacement.
+        torch.testing.assert_close(
+            here.joint_derivative[0, :, :, joint], expected, atol=1e-3 * float(expected.abs().max()), rtol=0.0
+        )
+
+
+def rc_problem(observations):
+    from rmis_calib.solver import Problem
+
+    return Problem.from_observations(observations).flatten_batch()
+
+
+def test_clock_offset_is_found_from_most_of_a_second_away(moving):
+    recording = rc.load_recording(moving, clock_offset_s=0.0)
+    poses = motion_poses(recording)
+    unknowns = KinematicUnknowns(recording, poses.frames, "cpu")
+    observations = observations_from_truth(moving, recording, poses)
+    solution = estimate_with_kinematics(observations, parse_config({}), unknowns)
+    clock = solution.nuisances["clock"]
+    assert float(clock.value) == pytest.approx(CLOCK_S, abs=0.01)
+    assert not bool(clock.held)
+
+
+def test_joint_offsets_are_found_within_their_sigmas_or_held(moving):
+    recording = rc.load_recording(moving, clock_offset_s=CLOCK_S)
+    poses = motion_poses(recording)
+    unknowns = KinematicUnknowns(recording, poses.frames, "cpu")
+    observations = observations_from_truth(moving, recording, poses)
+    config = parse_config({"solver": {"unknowns": {"joint_offsets": True, "clock": False}}})
+    solution = estimate_with_kinematics(observations, config, unknowns)
+    offsets = solution.nuisances["joint_offset"]
+    truth = yaml.safe_load((moving / "ground_truth.yaml").read_text())["joint_offsets"]
+    expected = torch.tensor([truth[column] for column in unknowns.columns], dtype=torch.float64)
+    free = ~offsets.held
+    assert bool(free.any())
+    assert bool(((offsets.value - expected).abs() < 4.0 * offsets.sigma)[free].all())

@@ -1,0 +1,97 @@
+"""Which candidate of a frame is taken, and in which direction."""
+
+import numpy as np
+import pytest
+import torch
+
+from rmis_calib.geometry.lines import contour_planes
+from rmis_calib.pipeline.observing import consistent_choice, first_choice
+from rmis_calib.vision import ShaftDetections
+
+RADIUS_MM = 4.0
+
+
+def contour_points(p, v):
+    """Two points on each contour of the cylinder through p along v, RCM side first; tangent rays by bisection."""
+    p, v = np.asarray(p, float), np.asarray(v, float) / np.linalg.norm(v)
+    edges = []
+    for side in (1.0, -1.0):
+        points = []
+        for s in (0.0, 30.0):
+            centre = p + s * v
+            # Turn the ray about the optical centre, across the shaft, until it just touches the cylinder.
+            across = np.cross(centre, v) / np.linalg.norm(np.cross(centre, v))
+            low, high = 0.0, 0.5
+            for _ in range(60):
+                angle = 0.5 * (low + high)
+                ray = np.cos(angle) * centre / np.linalg.norm(centre) - side * np.sin(angle) * across
+                gap = abs(np.dot(p, np.cross(ray, v))) / np.linalg.norm(np.cross(ray, v))
+                low, high = (angle, high) if gap < RADIUS_MM else (low, angle)
+            points.append(ray[:2] / ray[2])
+        edges.append(points)
+    return torch.tensor(np.array(edges))
+
+
+def detections(candidates, direction_known):
+    """One frame with these candidates' contours; what the choice does not look at is NaN."""
+    contour = torch.stack(list(candidates))[None]
+    k = contour.shape[1]
+    nan = torch.full((1, k), torch.nan)
+    known = torch.tensor([direction_known])
+    valid = torch.isfinite(contour).flatten(2).all(-1)
+    shapes = {
+        "valid": valid,
+        "reason": torch.zeros(1, dtype=torch.int64),
+        "contour_xy": contour,
+        "contour_sigma": nan[..., None].expand(1, k, 2),
+        "axis_xy": contour.mean(2),
+        "axis_sigma": nan,
+        "end_xy": nan[..., None].expand(1, k, 2),
+        "end_sigma": nan,
+        "end_valid": torch.zeros(1, k, dtype=torch.bool),
+        "direction_known": known,
+        "confidence": torch.linspace(0.9, 0.5, k)[None],
+        "contour_uv": nan[..., None, None, None].expand(1, k, 2, 4, 2),
+        "end_uv": nan[..., None].expand(1, k, 2),
+        "scatter_px": nan[..., None].expand(1, k, 2),
+        "blur_px": nan[..., None].expand(1, k, 2),
+    }
+    return ShaftDetections(**{name: shapes[name] for name in ShaftDetections.__dataclass_fields__})
+
+
+OURS = ([20.0, -10.0, 80.0], [-0.7, 0.3, 0.6])
+OTHER = ([-20.0, 10.0, 90.0], [0.5, 0.5, 0.4])
+
+
+@pytest.fixture
+def predicted():
+    p, v = (torch.tensor(x, dtype=torch.float64) for x in OURS)
+    return contour_planes(p, v / v.norm(), RADIUS_MM)[None]
+
+
+def test_first_choice_is_the_most_confident_with_a_known_direction():
+    choice = first_choice(detections([contour_points(*OTHER), contour_points(*OURS)], [False, True]))
+    assert choice.candidate.tolist() == [1]
+    assert first_choice(detections([contour_points(*OURS)], [False])).candidate.tolist() == [-1]
+
+
+def test_the_candidate_that_fits_the_kinematics_wins_over_confidence(predicted):
+    choice = consistent_choice(detections([contour_points(*OTHER), contour_points(*OURS)], [True, True]), predicted)
+    assert (choice.candidate.tolist(), choice.reversed.tolist()) == ([1], [False])
+
+
+def test_an_unknown_direction_is_taken_as_it_fits(predicted):
+    walked_back = contour_points(*OURS).flip(0).flip(1)  # the edges change sides, the points change order
+    choice = consistent_choice(detections([walked_back], [False]), predicted)
+    assert (choice.candidate.tolist(), choice.reversed.tolist()) == ([0], [True])
+
+
+def test_a_known_direction_is_never_turned(predicted):
+    walked_back = contour_points(*OURS).flip(0).flip(1)
+    choice = consistent_choice(detections([walked_back], [True]), predicted)
+    assert choice.reversed.tolist() == [False]
+
+
+def test_a_frame_without_candidates_has_none(predicted):
+    empty = torch.full((2, 2, 2), torch.nan, dtype=torch.float64)
+    assert consistent_choice(detections([empty], [False]), predicted).candidate.tolist() == [-1]
