@@ -106,48 +106,51 @@ def _follow(picture: SmallPicture, strips: Strips, stations: Float[Tensor, "b k 
     return _Sides(place, step, outer, beside, seen[..., _OFFSETS // 2, :].all(-1))
 
 
+@dataclass(frozen=True, eq=False)
+class _Middle:
+    inner: Float[Tensor, "b k s"]
+    far: Float[Tensor, "b k s"]
+    brightness: Float[Tensor, "b k s"]
+    seen: Bool[Tensor, "b k s"]
+
+
+def _read_middle(picture: SmallPicture, strips: Strips, stations: Float[Tensor, "b k s"], sides: _Sides) -> _Middle:
+    """Tone of the inside, and of both sides most of a width away from the middle line."""
+    left, right = sides.lateral.unbind(2)
+    across = left.new_tensor([-0.35, -0.233, -0.117, 0.0, 0.117, 0.233, 0.35, -0.85, 0.85])
+    y = 0.5 * (left + right)[..., None] + (left - right)[..., None] * across
+    value, seen, tone = picture.read(strips.points(stations[..., None].expand_as(y), y))
+    # The third darkest of seven: a glare stripe may cover half of the width and more.
+    inner, brightness = (layer[..., :7].kthvalue(3, -1).values for layer in (value, tone))
+    far = torch.where(seen[..., 7:], value[..., 7:], torch.inf).amin(-1)
+    return _Middle(inner, far, brightness, seen[..., 3])
+
+
 def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> Trace:
     """Contours, the stretch that is a shaft, and which way the tip is."""
     t = torch.linspace(-1, 1, _STATIONS, device=strips.offset.device) * picture.half_diagonal_px
     spacing = float(t[1] - t[0])
     stations = t.expand(*strips.valid.shape, _STATIONS)
     sides = _follow(picture, strips, stations)
-    left, right = sides.lateral.unbind(2)
-    across = t.new_tensor([-0.35, -0.233, -0.117, 0.0, 0.117, 0.233, 0.35, -0.85, 0.85])
-    inner_y = 0.5 * (left + right)[..., None] + (left - right)[..., None] * across
-    value, inner_seen, tone = picture.read(strips.points(stations[..., None].expand_as(inner_y), inner_y))
-    # The third darkest of seven: a glare stripe may cover half of the width and more.
-    inner, centre_seen = value[..., :7].kthvalue(3, -1).values, inner_seen[..., 3]
-
-    inf = t.new_tensor(torch.inf)
-    step = torch.where(sides.seen, sides.rise, inf).amin(2)
-    outer = torch.where(sides.seen, sides.outer, inf).amin(2)
-    wide = left - right > settings.min_width_fraction * picture.width_px
-    on = centre_seen & sides.seen.any(2) & wide & strips.valid[..., None]
-    on &= tone[..., :7].kthvalue(3, -1).values - sides.brightness.mean(2) < MAX_BRIGHTER
-    on &= (step > settings.min_contrast) & (inner < outer - 0.5 * settings.min_contrast)
-    surround = masked_median(torch.where(on, outer, 0.0) - inner, on)
-    edged = on
-    on = on & _own_tone(inner, outer, on, on)
-    width = masked_median(left - right, on & sides.seen.all(2))
+    middle = _read_middle(picture, strips, stations, sides)
+    span = sides.lateral[:, :, 0] - sides.lateral[:, :, 1]
+    step = torch.where(sides.seen, sides.rise, torch.inf).amin(2)
+    outer = torch.where(sides.seen, sides.outer, torch.inf).amin(2)
+    edged = middle.seen & sides.seen.any(2) & strips.valid[..., None]
+    edged &= span > settings.min_width_fraction * picture.width_px
+    edged &= middle.brightness - sides.brightness.mean(2) < MAX_BRIGHTER
+    edged &= (step > settings.min_contrast) & (middle.inner < outer - 0.5 * settings.min_contrast)
+    surround = masked_median(torch.where(edged, outer, 0.0) - middle.inner, edged)
+    on = edged & _own_tone(middle.inner, outer, edged, edged)
+    width = masked_median(span, on & sides.seen.all(2))
     on &= run_lengths(on) * spacing > (0.4 * width).clamp(min=2.5 * spacing)[..., None]
-    # The end may lie on a stretch whose contours do not continue these lines (a sleeve, a lens that bends them): there
-    # it is enough that the inside has the shaft's tone and both sides, most of a width away, do not. Only beyond an
-    # interruption, such as a ball: a wrist follows the shaft at once and is darker than tissue as well.
-    far = torch.where(inner_seen[..., 7:], value[..., 7:], inf).amin(-1)
-    darker = centre_seen & torch.isfinite(far) & (inner < far - settings.min_contrast) & strips.valid[..., None]
     main = longest_run(on, 0.7 * width / spacing)
-    to_border, borders = _enter(t, edged, main, centre_seen, width)
+    to_border, borders = _enter(t, edged, main, middle.seen, width)
     on, main = on | to_border, main | to_border
     line = strips.contour(stations)
     wander = smooth_over(sides.lateral - line, (on[:, :, None] & sides.seen))
-    beyond = darker & ~run_any(bridge(darker | on, 0.3 * width / spacing), main)
-    band = on | (beyond & (run_range(inner) < _RUN_UNEVENNESS) & _own_tone(inner, far, beyond, on))
-    long_runs = band & (run_lengths(band) * spacing > settings.end_run_widths * width[..., None] - spacing)
-    carries_end = torch.where(long_runs.any(-1, keepdim=True), long_runs, main)
-    down, up = (_same_tone(t, inner, main, centre_seen, surround, width, high) for high in (False, True))
-    contrast = masked_median(torch.where(torch.isfinite(step), step, 0.0), on)
-    length = on.float().sum(-1) * spacing
+    carries_end = _carries_end(middle, on & strips.valid[..., None], main, width / spacing, settings)
+    down, up = (_same_tone(t, middle.inner, main, middle.seen, surround, width, high) for high in (False, True))
     whole = Trace(
         strips=strips,
         t=t,
@@ -160,11 +163,39 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
         start_at_border=borders[0],
         end_at_border=borders[1],
         width=width,
-        length=length,
-        contrast=contrast,
+        length=on.float().sum(-1) * spacing,
+        contrast=masked_median(torch.where(torch.isfinite(step), step, 0.0), on),
         surround=surround,
     )
-    return _towards_tip(whole, first_on(t, carries_end | down), last_on(t, on), t, centre_seen)
+    return _towards_tip(whole, first_on(t, carries_end | down), last_on(t, on), t, middle.seen)
+
+
+def _carries_end(
+    middle: _Middle,
+    on: Bool[Tensor, "b k s"],
+    main: Bool[Tensor, "b k s"],
+    width: Float[Tensor, "b k"],
+    settings: DetectorSettings,
+) -> Bool[Tensor, "b k s"]:
+    """Stations among which the shaft's end is: those of stretches long enough, or else of the longest.
+
+    The end may lie on a stretch whose contours do not continue the lines (a sleeve, a lens that bends them). There it is
+    enough that the inside has the shaft's tone and both sides, most of a width away, do not; and only beyond an
+    interruption, such as a ball: a wrist follows the shaft at once and is darker than tissue as well.
+
+    Args:
+        middle: tones along the middle line.
+        on: stations with contours.
+        main: the longest stretch of them.
+        width: width of the shaft, in stations.
+        settings: shortest stretch that counts, least contrast.
+    """
+    inner, far = middle.inner, middle.far
+    darker = middle.seen & torch.isfinite(far) & (inner < far - settings.min_contrast)
+    beyond = darker & ~run_any(bridge(darker | on, 0.3 * width), main)
+    band = on | (beyond & (run_range(inner) < _RUN_UNEVENNESS) & _own_tone(inner, far, beyond, on))
+    long_runs = band & (run_lengths(band) > settings.end_run_widths * width[..., None] - 1)
+    return torch.where(long_runs.any(-1, keepdim=True), long_runs, main)
 
 
 def _same_tone(
