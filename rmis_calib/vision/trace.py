@@ -179,8 +179,8 @@ def _carries_end(
 ) -> Bool[Tensor, "b k s"]:
     """Stations among which the shaft's end is: those of stretches long enough, or else of the longest.
 
-    The end may lie on a stretch whose contours do not continue the lines (a sleeve, a lens that bends them). There it is
-    enough that the inside has the shaft's tone and both sides, most of a width away, do not; and only beyond an
+    The end may lie on a stretch whose contours do not continue the lines (a sleeve, a lens that bends them). There it
+    is enough that the inside has the shaft's tone and both sides, most of a width away, do not; and only beyond an
     interruption, such as a ball: a wrist follows the shaft at once and is darker than tissue as well.
 
     Args:
