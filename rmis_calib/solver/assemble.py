@@ -1,6 +1,6 @@
 """Estimates made into solutions: status, reasons, covariance, nuisances, observability and residuals."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -52,6 +52,7 @@ def two_step_solution(
     # A two-step estimate from a laparoscope that stands still is biased by more than its scatter shows (DESIGN.md,
     # section 3).
     sight = replace(sight, verdict=torch.where(static, sight.verdict.clamp_min(1), sight.verdict))
+    shown = _residuals(packed, state)
     return Solution(
         method=method,
         camera_right_T_arm=rigid_from_rotation_translation(R, t),
@@ -67,9 +68,9 @@ def two_step_solution(
         nuisances={},
         bias=torch.zeros_like(covariance[..., 0]),
         sight=sight,
-        residual_lines=_rms(packed, state, LINE),
-        residual_ends=_rms(packed, state, END),
-        residual_heads=_rms(packed, state, HEAD),
+        residual_lines=shown.lines,
+        residual_ends=shown.ends,
+        residual_heads=shown.heads,
     )
 
 
@@ -104,6 +105,7 @@ def joint_solution(fit: JointFit, settings: SolverSettings) -> Solution:
     distance = (fit.distance2 / packed.rows_ok.sum(0).clamp_min(1)).sqrt()
     uses = (packed.has_contours, packed.has_ends, packed.has_heads)
     left = rigid_from_rotation_translation(state.stereo_R, state.stereo_t) if packed.cameras == 2 else None
+    shown = _residuals(packed, state)
     return Solution(
         method="joint",
         camera_right_T_arm=rigid_from_rotation_translation(state.R, state.t),
@@ -120,9 +122,9 @@ def joint_solution(fit: JointFit, settings: SolverSettings) -> Solution:
         bias=fit.bias[:, :6],
         history=fit.history,
         sight=_sight(fit.problem, state.R, state.t, C, fit.noise, uses, settings),
-        residual_lines=_rms(packed, state, LINE),
-        residual_ends=_rms(packed, state, END),
-        residual_heads=_rms(packed, state, HEAD),
+        residual_lines=shown.lines,
+        residual_ends=shown.ends,
+        residual_heads=shown.heads,
     )
 
 
@@ -184,18 +186,34 @@ def _sight(
     return replace(first, degeneracy=flags)
 
 
-def _rms(packed: Packed, state: State, kind: int) -> Float[Tensor, "b c n"]:
-    """Root mean square of one kind, per camera and motion; a long recording in parts. NaN where not measured."""
+@dataclass(frozen=True)
+class _Residuals:
+    """Root mean square residuals per camera and motion of each kind; NaN where not measured."""
+
+    lines: Float[Tensor, "b c n"]
+    ends: Float[Tensor, "b c n"]
+    heads: Float[Tensor, "b c n"]
+
+
+def _residuals(packed: Packed, state: State) -> _Residuals:
+    """Residuals of all motions, a long recording in parts."""
     step = max(1, 8 * SHOWN_MOTIONS // packed.trials)
-    kinds, cameras = torch.tensor(packed.row_kind), torch.tensor(packed.row_camera)
-    parts = []
-    for n in range(0, packed.motions, step):
-        part = packed.narrow(slice(None), slice(n, n + step))
-        r, ok = residual_rows(part, state), part.rows_ok
+    parts = [
+        _residuals_of(packed.narrow(slice(None), slice(n, n + step)), state) for n in range(0, packed.motions, step)
+    ]
+    return _Residuals(*(torch.cat([part[i] for part in parts], dim=-1) for i in range(3)))
+
+
+def _residuals_of(packed: Packed, state: State) -> list[Float[Tensor, "b c n"]]:
+    """Lines, ends and heads of motions that fit into memory at once."""
+    r, ok = residual_rows(packed, state), packed.rows_ok
+    kinds, cameras = (torch.tensor(x, device=r.device) for x in (packed.row_kind, packed.row_camera))
+    out = []
+    for kind in (LINE, END, HEAD):
         per_camera = []
         for c in range(packed.cameras):
-            rows = torch.nonzero((kinds == kind) & (cameras == c))[:, 0].to(r.device)
+            rows = torch.nonzero((kinds == kind) & (cameras == c))[:, 0]
             count = ok[rows].sum(0)
             per_camera.append(torch.where(count > 0, (r[rows].square().sum(0) / count.clamp_min(1)).sqrt(), torch.nan))
-        parts.append(torch.stack(per_camera, dim=1))
-    return torch.cat(parts, dim=-1)
+        out.append(torch.stack(per_camera, dim=1))
+    return out
