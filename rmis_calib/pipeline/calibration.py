@@ -167,10 +167,11 @@ def _solve_choice(
     progress("solving", 1, 1)
     motions = _motions(recording, views, poses, choices, solution)
     columns = () if unknowns is None else unknowns.columns
-    result = make_result(solution, motions, _residuals_px(recording, poses, solution), config, columns)
+    result = make_result(solution, motions, _residuals_px(recording, poses, solution, motions.used), config, columns)
     errors = head_point_errors(result, recording, poses)
     residuals = result.residuals | {
-        f"head_{side}": residual_record(distance, "px") for side, distance in (errors or {}).items()
+        f"head_{side}": residual_record(distance, "px", np.isfinite(distance))
+        for side, distance in (errors or {}).items()
     }
     result = replace(result, residuals=residuals, head_point_error_px=summarise_head_points(errors))
     return CalibrationRun(result, recording, views, poses, choices, observations, solution)
@@ -230,7 +231,9 @@ def _motions(
     return Motions(used, tuple(reasons), recording.frame_times_s)
 
 
-def _residuals_px(recording: Recording, poses: MotionPoses, solution: Solution) -> dict[str, dict[str, Any]]:
+def _residuals_px(
+    recording: Recording, poses: MotionPoses, solution: Solution, used: np.ndarray
+) -> dict[str, dict[str, Any]]:
     """Residuals of each kind and camera in pixels, by frame."""
     left = recording.stereo.left
     arrays = residual_arrays(
@@ -240,7 +243,7 @@ def _residuals_px(recording: Recording, poses: MotionPoses, solution: Solution) 
     for name, by_motion in arrays.items():
         by_frame = np.full(recording.n_frames, np.nan)
         by_frame[poses.frames] = by_motion
-        records[name] = residual_record(by_frame, "px")
+        records[name] = residual_record(by_frame, "px", used)
     return records
 
 

@@ -46,7 +46,7 @@ def solve(
     require_device(config.device)
     solution = estimate(observations, config)
     motions = Motions(*used_motions(solution))
-    result = make_result(solution, motions, residuals_normalised(solution), config)
+    result = make_result(solution, motions, residuals_normalised(solution, motions.used), config)
     if throw:
         raise_unless_trustworthy(result)
     return result
@@ -165,10 +165,10 @@ def used_motions(solution: Solution) -> tuple[np.ndarray, tuple[str, ...]]:
     return used, tuple("" if code is MotionReason.USED else code.sentence for code in codes)
 
 
-def residuals_normalised(solution: Solution) -> dict[str, dict[str, Any]]:
+def residuals_normalised(solution: Solution, used: np.ndarray) -> dict[str, dict[str, Any]]:
     """Residuals per kind and camera in normalised image units, for observations without a camera."""
     return {
-        name: residual_record(by_motion, "1e-3 of the focal length")
+        name: residual_record(by_motion, "1e-3 of the focal length", used)
         for name, by_motion in residual_arrays(solution, 1e3, 1e3).items()
     }
 
@@ -185,9 +185,9 @@ def residual_arrays(solution: Solution, scale_right: float, scale_left: float) -
     return arrays
 
 
-def residual_record(by_motion: np.ndarray, unit: str) -> dict[str, Any]:
-    """Median and root mean square of what was measured, with the value of every motion."""
-    known = by_motion[np.isfinite(by_motion)]
+def residual_record(by_motion: np.ndarray, unit: str, used: np.ndarray) -> dict[str, Any]:
+    """Median and root mean square over the used motions, with the value of every motion that was measured."""
+    known = by_motion[np.isfinite(by_motion) & used]
     median = float(np.median(known)) if len(known) else None
     rms = float(np.sqrt(np.mean(known**2))) if len(known) else None
     return {"unit": unit, "median": median, "rms": rms, "by_motion": by_motion}
