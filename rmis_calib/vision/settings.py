@@ -16,7 +16,7 @@ class DetectorSettings:
     """Width, px, of the small picture on which shafts are searched for; sub-pixel work is at full resolution."""
     min_width_fraction: float = Field(default=0.02, gt=0, lt=1)
     """Narrowest shaft, as a fraction of the picture's width."""
-    max_width_fraction: float = Field(default=0.30, gt=0, lt=1)
+    max_width_fraction: float = Field(default=0.22, gt=0, lt=1)
     """Widest shaft, as a fraction of the picture's width."""
     max_convergence_deg: float = Field(default=14.0, gt=0, lt=45)
     """Largest angle, deg, between the two contour lines of one shaft (perspective)."""
