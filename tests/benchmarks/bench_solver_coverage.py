@@ -32,9 +32,7 @@ def main() -> int:
     parser.add_argument("--only", type=int, nargs="*")
     args = parser.parse_args()
     bad = 0
-    print(
-        f"{'scene':34} {'N':>4} | noise given | noise estimated   (part of {args.trials} trials inside; 0.93 to 0.97 wanted)"
-    )
+    print(f"{'scene':34} {'N':>4} | noise given | noise estimated  (inside, of {args.trials}; 0.93 to 0.97)")
     for i, (name, kinds, cameras, motion, laparoscope) in enumerate(CELLS):
         if args.only and i not in args.only:
             continue
@@ -57,7 +55,8 @@ def main() -> int:
             scale.append(float(distance2.mean() / 6.0))
             bad += not 0.93 <= inside[-1] <= 0.97
         print(
-            f"{name:34} {trial.problem.n_motions:4d} |   {inside[0]:.3f}     |   {inside[1]:.3f}      mean d^2/6: {scale[0]:.2f}, {scale[1]:.2f}",
+            f"{name:34} {trial.problem.n_motions:4d} |   {inside[0]:.3f}     |   {inside[1]:.3f}"
+            f"      mean d^2/6: {scale[0]:.2f}, {scale[1]:.2f}",
             flush=True,
         )
     return 1 if bad else 0

@@ -64,7 +64,7 @@ def main():
     args = parser.parse_args()
     rows, bad = [], []
     print(
-        f"{'noise':10} {'N':>5} {'measurements':14} {'cams':>4} | {'bound':>16} | {'without correction':>18} | {'joint':>12} | worst deg"
+        f"{'noise':10} {'N':>5} {'measurements':14} {'cams':>4} | {'bound':>17} | {'plain':>17} | {'joint':>12} | worst"
     )
     for name, noise in CELLS:
         for _, kinds in KINDS:
@@ -85,8 +85,11 @@ def main():
 def report(row, bad, limit=None):
     label = "static" if row["static"] else row["noise"]
     print(
-        f"{label:10} {row['N']:5d} {row['kinds']:14} {row['cameras']:4d} | {row['bound_deg']:.4f} {row['bound_mm']:7.4f} mm | "
-        f"{row['plain_ratio_deg']:8.2f} {row['plain_ratio_mm']:8.2f} | {row['joint_ratio_deg']:5.2f} {row['joint_ratio_mm']:5.2f} | {row['joint_worst_deg']:.2f}",
+        f"{label:10} {row['N']:5d} {row['kinds']:14} {row['cameras']:4d} | "
+        f"{row['bound_deg']:.4f} {row['bound_mm']:7.4f} mm | "
+        f"{row['plain_ratio_deg']:8.2f} {row['plain_ratio_mm']:8.2f} | "
+        f"{row['joint_ratio_deg']:5.2f} {row['joint_ratio_mm']:5.2f} | "
+        f"{row['joint_worst_deg']:.2f}",
         flush=True,
     )
     limit = limit or LIMITS.get(row["noise"])

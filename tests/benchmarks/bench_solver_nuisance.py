@@ -27,7 +27,6 @@ from rmis_calib.solver.settings import UnknownSettings
 from tests.benchmarks.bench_solver_common import REALISTIC, config, errors, rms, rotation_deg, translation_mm
 
 FRAMES_PER_S = 10.0
-UNITS = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -100,7 +99,8 @@ class Recorded:
         sigma = torch.tensor([np.deg2rad(0.5), np.deg2rad(0.5), 1.0] * 2, dtype=torch.float64)
         return replace(
             problem,
-            joint_derivative=torch.as_tensor(np.stack(derivative, -1)), joint_offset_sigma=sigma.expand(b, 6), joint_offset_at=joint_offset,
+            joint_derivative=torch.as_tensor(np.stack(derivative, -1)), joint_offset_sigma=sigma.expand(b, 6),
+            joint_offset_at=joint_offset,
             clock_derivative=torch.as_tensor(clock), clock_at=clock_s,
         )  # fmt: skip
 
@@ -181,11 +181,12 @@ def row(
         if found is None
         else " ".join(
             f"{v:+.4f}+-{s:.4f}{'(held)' if h else ''}"
-            for v, s, h in zip(found.value[0].tolist(), found.sigma[0].tolist(), found.held[0].tolist())
+            for v, s, h in zip(found.value[0].tolist(), found.sigma[0].tolist(), found.held[0].tolist(), strict=False)
         )
     )
     print(
-        f"{name:34} | {out[0][0]:8.3f} {out[0][1]:8.3f} ({out[0][2]:.3f}) | {out[1][0]:8.3f} {out[1][1]:8.3f} ({out[1][2]:.3f}) | {text}",
+        f"{name:34} | {out[0][0]:8.3f} {out[0][1]:8.3f} ({out[0][2]:.3f}) | "
+        f"{out[1][0]:8.3f} {out[1][1]:8.3f} ({out[1][2]:.3f}) | {text}",
         flush=True,
     )
 

@@ -109,8 +109,10 @@ def main() -> int:
                 )
                 bad += ratio > 1.5
                 print(
-                    f"{trial.problem.n_motions:7d}  {'moves' if laparoscope > 1 else 'static':11}  {'+'.join(kinds):16} {cameras:4d} | "
-                    f"{rms(rotation_deg(clean)):.4f} / {rms(translation_mm(clean)):.4f} | {rms(rotation_deg(e)):8.4f} / {rms(translation_mm(e)):.4f}     | "
+                    f"{trial.problem.n_motions:7d}  {'moves' if laparoscope > 1 else 'static':11}  "
+                    f"{'+'.join(kinds):16} {cameras:4d} | "
+                    f"{rms(rotation_deg(clean)):.4f} / {rms(translation_mm(clean)):.4f} | "
+                    f"{rms(rotation_deg(e)):8.4f} / {rms(translation_mm(e)):.4f}     | "
                     f"{float(rotation_deg(e).max()):8.3f}  | {ratio:.2f}",
                     flush=True,
                 )

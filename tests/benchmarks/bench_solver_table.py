@@ -31,12 +31,8 @@ def main() -> int:
     parser.add_argument("--range-mm", type=float, default=20.0)
     args = parser.parse_args()
     settings = SolverSettings(unknowns=KNOWN_RADIUS)
-    print(
-        f"deg / mm, median [rmse] of {args.trials} trials, axis lines, stereo; paper: trials off by more than 20 deg in brackets"
-    )
-    print(
-        f"{'noise':30} | {'paper':32} | {'global':30} | {'joint':30} | {'bound':15} | joint with contours and ends (bound)"
-    )
+    print(f"deg / mm, median [rmse] of {args.trials} trials, axis lines, stereo; (paper: trials off by > 20 deg)")
+    print(f"{'noise':30} | {'paper':32} | {'global':30} | {'joint':30} | {'bound':15} | joint, contours + ends (bound)")
     for name, noise in ROWS:
         settings_of = config(
             noise, args.trials, 7, rotation_range_deg=args.range_deg, translation_range_mm=args.range_mm

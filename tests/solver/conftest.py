@@ -23,5 +23,6 @@ def simulate():
 def realistic():
     """Noise of a good robot and camera: 0.3 px; 0.3 mm and 0.1 deg; stereo 0.05 mm and 0.05 deg."""
     return {
-        "pixel_noise_px": 0.3, "kinematics_noise_mm": 0.3, "kinematics_noise_deg": 0.1, "stereo_noise_mm": 0.05, "stereo_noise_deg": 0.05,
+        "pixel_noise_px": 0.3, "kinematics_noise_mm": 0.3, "kinematics_noise_deg": 0.1, "stereo_noise_mm": 0.05,
+        "stereo_noise_deg": 0.05,
     }  # fmt: skip

@@ -110,7 +110,8 @@ def test_jacobian_of_every_unknown_equals_autodiff(scene):
     settings = SolverSettings(unknowns=EVERYTHING)
     layout = make_layout(Nominal.of(problem), packed, state, settings.unknowns, settings.noise)
     assert list(layout.blocks) == [
-        "rotation", "translation", "stereo_rotation", "stereo_translation", "radius", "end_offset", "rcm_offset", "joint_offset", "clock",
+        "rotation", "translation", "stereo_rotation", "stereo_translation", "radius", "end_offset", "rcm_offset",
+        "joint_offset", "clock",
     ]  # fmt: skip
     exact = replace_measurements(packed, state)
     rows, shaft = linearise(exact, state)
