@@ -1,0 +1,101 @@
+"""The detector's parts, each against numbers worked out by hand or by simulation."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from drawn_bars import draw_bar
+from pydantic import ValidationError
+
+from rmis_calib.geometry import Camera
+from rmis_calib.vision import DetectorSettings, FrameReason
+from rmis_calib.vision.canvas import plan_canvas, shrink
+from rmis_calib.vision.hough import EdgePixels, peaks, refine, vote
+from rmis_calib.vision.lens import Lens
+from rmis_calib.vision.linefit import fit_lines
+from rmis_calib.vision.runs import bridge, longest_run, run_lengths
+from rmis_calib.vision.shaft_mask import field_of_view, unlikeness
+
+
+@pytest.mark.parametrize("field", [{"max_shafts": 0}, {"min_contrast": float("nan")}, {"edge_sample": 300}])
+def test_impossible_settings_are_refused(field: dict) -> None:
+    with pytest.raises(ValidationError):
+        DetectorSettings(**field)
+
+
+def test_every_reason_has_a_sentence() -> None:
+    assert all(len(reason.sentence) > 10 for reason in FrameReason)
+
+
+def test_runs() -> None:
+    on = torch.tensor([[1, 1, 0, 1, 1, 1, 0, 0, 0, 1]], dtype=torch.bool)
+    assert run_lengths(on).tolist() == [[2, 2, 0, 3, 3, 3, 0, 0, 0, 1]]
+    gap = torch.tensor([1.0])
+    assert bridge(on, gap).int().tolist() == [[1, 1, 1, 1, 1, 1, 0, 0, 0, 1]]
+    assert longest_run(on, gap).int().tolist() == [[1, 1, 0, 1, 1, 1, 0, 0, 0, 0]]
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3, 4, 5, 6])
+def test_shrinking_keeps_a_ramp_in_its_place(factor: int) -> None:
+    ramp = torch.arange(60.0).repeat(60, 1)[None, None].repeat(1, 3, 1, 1) / 60
+    small = shrink(ramp, factor)[0, 0, 0]
+    expected = (torch.arange(60 // factor) * factor + 0.5 * (factor - 1)) / 60
+    assert torch.allclose(small, expected, atol=1e-6)
+
+
+def test_the_field_of_view_ignores_a_black_shaft() -> None:
+    v, u = np.mgrid[:120, :160]
+    disc = np.hypot(u - 80, v - 60) < 55
+    rgb = torch.from_numpy(np.where(disc, 0.5, 0.0)).float().expand(1, 3, 120, 160).clone()
+    rgb[:, :, 50:70, :90] = 0.0  # as black as the border, from the left edge to beyond the middle
+    field, within = field_of_view(rgb, 0.035, 4)
+    # Rows lit over less than a quarter of the width are cut: two per cent of this disc.
+    assert (field[0].numpy() == disc).mean() > 0.97
+    assert bool(field[0, 60, 40])
+    assert not bool((within & ~field).any())
+
+
+def test_unlikeness_is_low_on_the_shaft() -> None:
+    bar = draw_bar(0.0, size=(120, 160), width_px=30.0, end_px=400.0)
+    rgb = bar.batch.float() / 255
+    unlike, _ = unlikeness(rgb, torch.ones(1, 120, 160, dtype=torch.bool))
+    assert float(unlike[0, 60, 80]) < float(unlike[0, 20, 80]) - 1.0
+
+
+def test_votes_find_a_line_and_its_outer_side() -> None:
+    angle = math.radians(40.0)
+    normal = torch.tensor([math.cos(angle), math.sin(angle)])
+    t = torch.linspace(-60, 60, 121)[:, None]
+    uv = 23.4 * normal + t * torch.tensor([-normal[1], normal[0]])
+    edges = EdgePixels(torch.zeros(121, dtype=torch.int64), uv, normal.expand(121, 2), torch.ones(121))
+    lines = refine(edges, peaks(vote(edges, 1, 120.0), 4))
+    # The opposite normal, 220 degrees, would be the same line with its dark side exchanged.
+    assert torch.allclose(lines.normal[0, 0], normal, atol=1e-3)
+    assert abs(float(lines.rho[0, 0]) - 23.4) < 0.02
+
+
+def test_a_line_fit_resists_outliers_and_states_its_error() -> None:
+    generator = torch.Generator().manual_seed(3)
+    t = torch.linspace(-200, 200, 256).expand(400, 256)
+    y = 5.0 + 0.02 * t + 0.3 * torch.randn(400, 256, generator=generator)
+    y[:, 100:160] += 9.0  # a ball in front
+    fit = fit_lines(t, y, torch.ones_like(t), torch.ones_like(t, dtype=torch.bool), 0.01)
+    ends = torch.stack([fit.centre_t - fit.spread_t, fit.centre_t + fit.spread_t])
+    error = fit.offset + fit.slope * ends - (5.0 + 0.02 * ends)
+    # 0.3 sqrt(2 / 196) = 0.030 for the points that are left; the claim may exceed it, as it covers drifts too.
+    assert 0.026 < float(error.std()) < 0.036
+    assert 0.9 < float(fit.sigma_px.median() / error.std()) < 1.6
+    assert float((error.abs() < 3 * fit.sigma_px).float().mean()) > 0.98
+
+
+def test_the_canvas_holds_the_picture_undistorted() -> None:
+    camera = Camera.from_values(700.0, 700.0, 320.0, 240.0, (-0.35, 0.1, 0.0, 0.0, 0.0), image_size=(480, 640))
+    canvas = plan_canvas((480, 640), 2, Lens(camera), torch.device("cpu"))
+    corner, _ = camera.undistort_points(torch.tensor([4.0, 4.0], dtype=torch.float64))
+    ideal = corner * 700 + torch.tensor([320.0, 240.0], dtype=torch.float64)
+    place = (ideal - torch.tensor(canvas.origin, dtype=torch.float64)) / canvas.factor
+    assert bool((place >= 0).all())
+    ramp = torch.arange(320.0).repeat(240, 1)[None, None] / 320
+    value = canvas.lay_out(ramp)[0, 0, round(float(place[1])), round(float(place[0]))]
+    assert abs(float(value) - (4.0 - 0.5) / 2 / 320) < 0.01
