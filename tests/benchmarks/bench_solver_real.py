@@ -2,8 +2,8 @@
 
     python tests/benchmarks/bench_solver_real.py [--observations OUT/observations.npz]
 
-Lines and ends are found by the program itself (`rmis-calib calibrate` writes the observations; it runs here when no file
-is given). The reference is itself good to 0.8 mm.
+Lines and ends are found by the program itself (`rmis-calib calibrate` writes the observations; it runs here when no
+file is given). The reference is itself good to 0.8 mm.
 """
 
 import argparse
@@ -51,9 +51,7 @@ def main() -> int:
     offset = solve(problem.only("contours", "ends", "heads")).nuisances["end_offset"].value[..., 0]
     shifted = replace(problem, rcm_s_end_mm=problem.rcm_s_end_mm + offset)
     rows.insert(1, ("contours, ends, offset known to 1 mm", shifted.only("contours", "ends"), known))
-    print(
-        f"{'measurements':38} | used | lines, px | head off, px | from reference        | own sigma          | d/3sig | verdict"
-    )
+    print(f"{'measurements':38} | used | lines, px | head off, px | from reference | own sigma | d/3sig | verdict")
     bad = 0
     for name, part, unknowns in rows:
         solution = solve(part, SolverSettings(unknowns=unknowns))
