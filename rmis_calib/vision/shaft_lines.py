@@ -273,7 +273,8 @@ def _confidence(trace: Trace, fit: LineFit, share: Float[Tensor, "b k"], reach_p
     """Chance that this is a shaft with both contours right, from contrast, length, agreement of the points, border."""
     contrast = trace.contrast / (trace.contrast + 0.08)
     length = 1 - torch.exp(-1.2 * trace.length / trace.width.clamp(min=1.0))
-    agreement = 1 / (1 + (fit.scatter_px.amax(-1) / (0.5 + 0.05 * trace.width)).square())
+    # Contours of a cavity wander by a twentieth of its width and more; those of a shaft out of focus by half of that.
+    agreement = 1 / (1 + (fit.scatter_px.amax(-1) / (1.0 + 0.035 * trace.width)) ** 4)
     border = torch.where(trace.start_at_border, 1.0, 0.45)
     # A short dark bar at the border may be anything; a long one is rarely furniture.
     size = 1 - torch.exp(-trace.length / (0.12 * reach_px))
