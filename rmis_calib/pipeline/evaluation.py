@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from rmis_calib.errors import InputError
@@ -69,12 +70,14 @@ def evaluate(
     """
     if result.camera_right_T_arm is None:
         raise InputError(where="result", expected="a transform to evaluate", found=f"status {result.status}")
-    recording = recording if isinstance(recording, Recording) else load_recording(recording)
-    truth = truth or recording.path / "ground_truth.yaml"
+    opened = recording if isinstance(recording, Recording) else load_recording(recording)
+    beside = opened.path / "ground_truth.yaml"
     rotation_deg, translation_mm, sigmas = None, None, None
-    if Path(truth).is_file() or truth != recording.path / "ground_truth.yaml":
-        rotation_deg, translation_mm, sigmas = _errors(result, _read_truth(Path(truth)))
-    errors = head_point_errors(result, recording, motion_poses(recording))
+    if truth is not None or beside.is_file():
+        rotation_deg, translation_mm, sigmas = _errors(
+            result.camera_right_T_arm.matrix, result.covariance, _read_truth(Path(truth or beside))
+        )
+    errors = head_point_errors(result, opened, motion_poses(opened))
     return Evaluation(summarise_head_points(errors), rotation_deg, translation_mm, sigmas)
 
 
@@ -126,17 +129,17 @@ def _read_truth(path: Path) -> RigidTransform:
     return RigidTransform("camera_right", "arm", matrix)
 
 
-def _errors(result: CalibrationResult, truth: RigidTransform) -> tuple[float, float, float | None]:
+def _errors(
+    found: Float[Tensor, "4 4"], covariance: np.ndarray | None, truth: RigidTransform
+) -> tuple[float, float, float | None]:
     """Rotation error (deg), translation error (mm), and both in units of the result's own covariance."""
-    assert result.camera_right_T_arm is not None
-    found: Tensor = result.camera_right_T_arm.matrix
     # R_true = exp(dphi) R_found and t_true = t_found + dt: the perturbation that the covariance describes.
     dphi = matrix_to_rotvec(truth.R @ rigid_inverse(found)[..., :3, :3])
     dt = truth.t - found[..., :3, 3]
     sigmas = None
-    if result.covariance is not None:
+    if covariance is not None:
         # Scaled to unit variances: radians and millimetres, and directions that are hardly known, differ by 1e12.
-        scale = np.sqrt(np.diag(result.covariance))
+        scale = np.sqrt(np.diag(covariance))
         error = np.concatenate([dphi.numpy(), dt.numpy()]) / scale
-        sigmas = math.sqrt(error @ np.linalg.pinv(result.covariance / np.outer(scale, scale), hermitian=True) @ error)
+        sigmas = math.sqrt(error @ np.linalg.pinv(covariance / np.outer(scale, scale), hermitian=True) @ error)
     return math.degrees(float(dphi.norm())), float(dt.norm()), sigmas

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from kornia.filters import gaussian_blur2d
 from torch import Tensor
-from torch.nn.functional import interpolate, pad
+from torch.nn.functional import interpolate
 
 # Below this brightness (fraction of full scale) ratios drown in sensor noise.
 _TONE_FLOOR = 0.06
@@ -23,8 +23,8 @@ _BLUR_PX = 1.4
 def scene_tint(rgb: Float[Tensor, "b 3 h w"], seen: Bool[Tensor, "b h w"]) -> Float[Tensor, "b h w"]:
     """How much of the scene's own colour a pixel has: 0 for grey, up to about 1; half of the chroma for other hues.
 
-    Opponent colours over brightness, because noise in a dark shaft must not look like a tint. The same with Lab (kornia)
-    found 50 of the 57 labelled real shafts, this 54 (tests/benchmarks/bench_vision_real_frames.py).
+    Opponent colours over brightness, because noise in a dark shaft must not look like a tint. The same with kornia's
+    Lab found 50 of the 57 labelled real shafts, this 54 (tests/benchmarks/bench_vision_real_frames.py).
     """
     red, green, blue = rgb.unbind(1)
     value = rgb.amax(1) + _TONE_FLOOR
