@@ -1,8 +1,8 @@
 """Named errors. Every one says where the mistake is, what was expected and what was found.
 
 Three kinds of failure never mix: a caller's mistake raises one of these; a frame without a usable shaft is data with a
-reason (`vision.FrameReason`); a solve that did not work is a status (`solver.SolveStatus`), which `calibrate` turns into
-`CalibrationFailed` unless it is told not to.
+reason (`vision.FrameReason`); a solve that did not work is a status (`solver.SolveStatus`), which `calibrate` turns
+into `CalibrationFailed` unless it is told not to.
 """
 
 from typing import Any

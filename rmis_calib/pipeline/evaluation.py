@@ -70,7 +70,7 @@ def evaluate(
     """
     if result.camera_right_T_arm is None:
         raise InputError(where="result", expected="a transform to evaluate", found=f"status {result.status}")
-    opened = recording if isinstance(recording, Recording) else load_recording(recording)
+    opened = load_recording(recording) if isinstance(recording, (str, Path)) else recording
     beside = opened.path / "ground_truth.yaml"
     rotation_deg, translation_mm, sigmas = None, None, None
     if truth is not None or beside.is_file():

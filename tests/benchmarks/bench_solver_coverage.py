@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import torch
 
 from rmis_calib.solver import SolverSettings, solve
-from tests.benchmarks.bench_solver_common import KNOWN_RADIUS, REALISTIC, config, errors, study
+from tests.benchmarks.solver_common import KNOWN_RADIUS, REALISTIC, config, errors, study
 
 QUANTILE_95 = 12.5916  # chi^2, 6 degrees of freedom
 CELLS = [

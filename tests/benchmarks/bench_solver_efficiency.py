@@ -14,7 +14,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from rmis_calib.solver import SolverSettings, solve
-from tests.benchmarks.bench_solver_common import (
+from tests.benchmarks.solver_common import (
     KNOWN_RADIUS,
     REALISTIC,
     config,

@@ -24,7 +24,7 @@ from rmis_calib.geometry.rotations import matrix_to_rotvec
 from rmis_calib.solver import Problem, SolverSettings, solve
 from rmis_calib.solver.relinearise import scan_clock
 from rmis_calib.solver.settings import UnknownSettings
-from tests.benchmarks.bench_solver_common import REALISTIC, config, errors, rms, rotation_deg, translation_mm
+from tests.benchmarks.solver_common import REALISTIC, config, errors, rms, rotation_deg, translation_mm
 
 FRAMES_PER_S = 10.0
 

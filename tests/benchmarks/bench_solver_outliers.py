@@ -18,7 +18,7 @@ import torch
 from rmis_calib.geometry.lines import contour_planes
 from rmis_calib.geometry.rotations import rotvec_to_matrix
 from rmis_calib.solver import Problem, SolverSettings, solve
-from tests.benchmarks.bench_solver_common import (
+from tests.benchmarks.solver_common import (
     KNOWN_RADIUS,
     REALISTIC,
     Study,

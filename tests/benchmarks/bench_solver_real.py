@@ -23,7 +23,7 @@ from rmis_calib.io import ShaftObservations
 from rmis_calib.solver import Problem, SolverSettings, solve
 from rmis_calib.solver.observability import VERDICTS
 from rmis_calib.solver.settings import UnknownSettings
-from tests.benchmarks.bench_solver_common import errors, rotation_deg, translation_mm
+from tests.benchmarks.solver_common import errors, rotation_deg, translation_mm
 
 REFERENCE_MM = 0.8
 

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from rmis_calib.solver import LineStatistics, Problem, SolverSettings, solve
 from rmis_calib.solver.initialise import find_candidates
-from tests.benchmarks.bench_solver_common import (
+from tests.benchmarks.solver_common import (
     KNOWN_RADIUS,
     REALISTIC,
     config,

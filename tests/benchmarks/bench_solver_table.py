@@ -13,7 +13,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from rmis_calib.solver import SolverSettings, solve
-from tests.benchmarks.bench_solver_common import KNOWN_RADIUS, config, errors, rms, rotation_deg, study, translation_mm
+from tests.benchmarks.solver_common import KNOWN_RADIUS, config, errors, rms, rotation_deg, study, translation_mm
 
 ROWS = [
     ("pixel only, 0.5 px", (0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)),

@@ -35,6 +35,7 @@ def everything() -> dict[str, Any]:
         "rcm_s_end_mm": 150 + generator.normal(size=N),
         "rcm_p_head": 160 + generator.normal(size=(N, 3)),
         "sigma_image": 1e-3,
+        "sigma_edge_bias": 3e-5,
     }
     levels = [f"sigma_{what}_{unit}" for what in ("kinematics", "camera", "stereo") for unit in ("mm", "rad")]
     arrays |= dict.fromkeys(levels, 0.0)
