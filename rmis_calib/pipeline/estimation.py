@@ -143,19 +143,28 @@ def make_result(
 
 
 def judge(solution: Solution) -> tuple[Status, str]:
-    """Status and its one line: a solve that did not work first, then what the data can tell."""
+    """Status and its one line: a solve that did not work first, then a model that does not fit, then sight."""
     status = SolveStatus(int(solution.status))
     observability = solution.observability()
+    strange = _strange_unknown(solution)
     if status is not SolveStatus.CONVERGED:
-        return "solver_failed", f"{STATUS_SENTENCES['solver_failed']}: {status.sentence}"
-    for name, nuisance in solution.nuisances.items():
-        pull = float(nuisance.pull.abs().max())
-        if pull > TOO_FAR_SIGMA:
-            where = f"the {name.replace('_', ' ')} is estimated {pull:.0f} prior sigmas from its nominal value"
-            return "weak", f"{STATUS_SENTENCES['weak']}: {where}; is a file wrong, or the clock off?"
+        why = f"{STATUS_SENTENCES['solver_failed']}: {status.sentence}"
+        return "solver_failed", f"{why}; {strange}" if strange else why
+    if strange:
+        return "weak", f"{STATUS_SENTENCES['weak']}: {strange}"
     names: dict[str, Status] = {"trustworthy": "ok", "weak": "weak", "unobservable": "unobservable"}
     name = names[observability.verdict.value]
     return name, f"{STATUS_SENTENCES[name]}: {observability.sentence}"
+
+
+def _strange_unknown(solution: Solution) -> str:
+    """The unknown that is furthest from its nominal value, in words, when it is further than its prior allows."""
+    pulls = {name: float(nuisance.pull.abs().max()) for name, nuisance in solution.nuisances.items()}
+    worst = max(pulls, key=lambda name: pulls[name], default="")
+    if not worst or pulls[worst] <= TOO_FAR_SIGMA:
+        return ""
+    where = f"the {worst.replace('_', ' ')} is estimated {pulls[worst]:.0f} prior sigmas from its nominal value"
+    return f"{where}: are the cameras swapped, is a unit or a file wrong, or the clock off?"
 
 
 def used_motions(solution: Solution) -> tuple[np.ndarray, tuple[str, ...]]:

@@ -49,6 +49,20 @@ def test_config_file_written_beside_the_result_repeats_it(demo_output):
     assert config == rc.CalibrationConfig()
 
 
+@pytest.mark.slow
+def test_swapped_cameras_are_noticed(demo_output):
+    """Left pictures taken for right ones still fit a rig of another shape: the answer must not look right."""
+    seen = rc.ShaftObservations.load(demo_output / "calibration" / "observations.npz")
+    sides = {"right": "left", "left": "right"}
+    swapped = {
+        f"{name}_{side}": getattr(seen, f"{name}_{other}")
+        for name in ("axis", "contour", "end", "valid", "sigma_axis", "sigma_contour", "sigma_end")
+        for side, other in sides.items()
+    }
+    with pytest.raises(rc.CalibrationFailed, match="are the cameras swapped"):
+        rc.solve(replace(seen, head_right=None, head_left=None, rcm_p_head=None, **swapped))
+
+
 @pytest.fixture(scope="module")
 def static_observations(tmp_path_factory):
     """Detections of a rendered recording whose laparoscope stands still."""
