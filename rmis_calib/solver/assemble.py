@@ -137,7 +137,8 @@ def _judge(fit: JointFit) -> tuple[Int[Tensor, " b"], Int[Tensor, "b n"], Float[
     reason = torch.where(good, MotionReason.USED, MotionReason.OUTLIER)
     reason = torch.where(good & (measured & ~used).any(0), MotionReason.OUTLIER_ONE_CAMERA, reason)
     reason = torch.where(measured.any(0), reason, MotionReason.NOT_MEASURED)
-    kept = (used & measured).sum((0, 2)) / measured.sum((0, 2)).clamp_min(1)
+    # By camera: with swapped videos one camera alone fits perfectly, and the other one not at all.
+    kept = torch.where(measured.any(-1), (used & measured).sum(-1) / measured.sum(-1).clamp_min(1), 1.0).amin(0)
     excess = fit.chi2 / (packed.keep(used).rows_ok.sum((0, 2)) - 6.0).clamp_min(1.0)
     status = fit.status
     for wrong, code in (

@@ -33,7 +33,7 @@ _SENTENCES = {
     SolveStatus.SINGULAR: "the measurements leave a direction of the unknown entirely free",
     SolveStatus.BEHIND_CAMERA: "the best fit puts the shaft behind the camera or its tip on the wrong side",
     SolveStatus.MISFIT: "the residuals are larger than the noise levels explain",
-    SolveStatus.INCONSISTENT: "fewer than half of the measurements agree with any single transform",
+    SolveStatus.INCONSISTENT: "a camera has more measurements that contradict the transform than agree with it (swapped cameras, another instrument?)",
 }
 
 
