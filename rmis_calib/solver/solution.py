@@ -33,7 +33,9 @@ _SENTENCES = {
     SolveStatus.SINGULAR: "the measurements leave a direction of the unknown entirely free",
     SolveStatus.BEHIND_CAMERA: "the best fit puts the shaft behind the camera or its tip on the wrong side",
     SolveStatus.MISFIT: "the residuals are larger than the noise levels explain",
-    SolveStatus.INCONSISTENT: "a camera has more measurements that contradict the transform than agree with it (swapped cameras, another instrument?)",
+    SolveStatus.INCONSISTENT: (
+        "a camera has more measurements that contradict the transform than agree with it (are the cameras swapped?)"
+    ),
 }
 
 
