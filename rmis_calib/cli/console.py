@@ -51,7 +51,8 @@ def _line_reporter() -> ProgressCallback:
 
 def print_table(title: str, rows: list[tuple[str, str]]) -> None:
     """Two columns: what, and how much with its unit."""
-    table = Table(title=title, title_justify="left", show_header=False, box=None, padding=(0, 2, 0, 0))
+    console.print(title, soft_wrap=True)
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     for name, value in rows:
         table.add_row(name, value)
     console.print(table)

@@ -53,7 +53,8 @@ class DetectionTable:
         rows = []
         for view in self.views:
             found = view.found
-            rows.append((f"camera_{view.side}", f"{int(found.sum())} of {len(found)} frames with a shaft"))
+            name = "pictures" if view.camera is None else f"camera_{view.side}"
+            rows.append((name, f"{int(found.sum())} of {len(found)} frames with a shaft"))
             ends = (view.detections.end_valid & view.detections.valid).any(dim=-1)
             rows.append(("  shaft end seen", f"{int(ends.sum())}"))
             codes, counts = view.detections.reason[~found].unique(return_counts=True)
