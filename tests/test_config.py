@@ -4,6 +4,7 @@ import pytest
 
 from rmis_calib.config import CalibrationConfig, load_config, parse_config
 from rmis_calib.errors import ConfigError, FileError, InputError
+from rmis_calib.io import config_names
 
 
 def test_defaults_run_everything():
@@ -48,6 +49,11 @@ def test_missing_file_and_preset(tmp_path):
         load_config(tmp_path / "absent.yaml")
     with pytest.raises(InputError, match="no-such-preset"):
         load_config("no-such-preset")
+
+
+@pytest.mark.parametrize("name", config_names("calibration"))
+def test_shipped_presets_change_something(name):
+    assert load_config(name) != CalibrationConfig()
 
 
 def test_round_trip_through_plain_values():
