@@ -15,7 +15,6 @@ from data_synth.props import HEAD_BEYOND_MM, RADIUS_MM, WRIST_MM, OtherInstrumen
 from data_synth.scene import Scene, ShaftInCamera, build_scene, poses_at, shaft_in_camera
 from data_synth.settings import SynthConfig
 
-SIDES = ("right", "left")
 ABSENT_MM = 400.0
 """An instrument that is absent is withdrawn this far."""
 SHOWN_MM = 12.0

@@ -24,9 +24,6 @@ from data_synth.settings import OutputSettings, SynthConfig
 from data_synth.truth import SideTruth, side_truth
 from data_synth.world import World, build_world
 
-BATCH = 4
-"""Frames drawn together."""
-
 Progress = Callable[[int, int], None]
 
 

@@ -5,7 +5,6 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
-FORMAT = "rmis-calib/1"
 METRES = "looks like metres; write millimetres"
 DEGREES = "looks like degrees; write radians"
 # A full turn and what rounding may add to it.

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -13,16 +12,18 @@ from rmis_calib.pipeline.calibration import CalibrationRun
 from rmis_calib.pipeline.detection import View
 from rmis_calib.report.overlays import DETECTED_RGB, PREDICTED_RGB, Overlay
 from rmis_calib.results import CalibrationResult
+from rmis_calib.vision import draw_dot, draw_polyline
 
-_SUBPIXEL_BITS = 4
 _SAMPLES = 200
 
 
 def overlays(run: CalibrationRun, count: int) -> Iterator[Overlay]:
     """Pictures spread over the motions of each view, rejected ones among them; -1 for all."""
     for view in run.views:
+        contours, ends = run.predicted_contours(view), run.predicted_ends(view)
         for motion in spread(len(run.poses.frames), count):
-            yield _overlay(run, view, int(motion))
+            contour_n = None if contours is None else contours[motion]
+            yield _overlay(run, view, int(motion), contour_n, None if ends is None else ends[motion])
 
 
 def spread(total: int, count: int) -> np.ndarray:
@@ -32,26 +33,30 @@ def spread(total: int, count: int) -> np.ndarray:
     return np.unique(np.linspace(0, total - 1, count).round().astype(int)) if count else np.arange(0)
 
 
-def _overlay(run: CalibrationRun, view: View, motion: int) -> Overlay:
+def _overlay(
+    run: CalibrationRun, view: View, motion: int, contour_n: Tensor | None, camera_p_end: Tensor | None
+) -> Overlay:
+    """One frame; `contour_n` (2, 3) and `camera_p_end` (3,) are what the result predicts for it."""
     frame = int(run.poses.frames[motion])
     canvas = np.ascontiguousarray(view.source.frame(frame).permute(1, 2, 0).cpu().numpy())
     thickness = max(1, round(canvas.shape[1] / 360))
     choice = run.choices[run.views.index(view)]
     candidate = int(choice.candidate[motion])
-    predicted, ends = run.predicted_contours(view), run.predicted_ends(view)
     detections = view.detections
     if candidate >= 0:
         for polyline in detections.contour_uv[frame, candidate].cpu().numpy():
-            _draw(canvas, polyline, DETECTED_RGB, thickness)
-        if bool(detections.end_valid[frame, candidate]):
-            _dot(canvas, detections.end_uv[frame, candidate].cpu().numpy(), DETECTED_RGB, 2 * thickness)
-    if predicted is not None and view.camera is not None:
-        for polyline in contour_polylines(predicted[motion], view.camera):
-            _draw(canvas, polyline, PREDICTED_RGB, max(1, thickness - 1))
-    if ends is not None and view.camera is not None:
-        uv, visible = view.camera.project(ends[motion].cpu())
+            draw_polyline(canvas, polyline, DETECTED_RGB, thickness)
+        if bool(detections.end_valid[frame, candidate]) and view.camera is not None:
+            # On the axis, as the prediction is: the rim that is seen lies in front of it, several px further along.
+            end = torch.nn.functional.pad(detections.end_xy[frame, candidate].double().cpu(), (0, 1), value=1.0)
+            draw_dot(canvas, view.camera.project(end)[0].numpy(), DETECTED_RGB, 2 * thickness)
+    if contour_n is not None and view.camera is not None:
+        for polyline in contour_polylines(contour_n, view.camera):
+            draw_polyline(canvas, polyline, PREDICTED_RGB, max(1, thickness - 1))
+    if camera_p_end is not None and view.camera is not None:
+        uv, visible = view.camera.project(camera_p_end.cpu())
         if bool(visible):
-            _dot(canvas, uv.numpy(), PREDICTED_RGB, thickness)
+            draw_dot(canvas, uv.numpy(), PREDICTED_RGB, thickness)
     used = bool(run.result.motions.used[frame])
     return Overlay(
         frame=frame, camera=view.side, image=canvas, caption=_caption(run.result, view.side, frame), used=used
@@ -76,16 +81,3 @@ def contour_polylines(contour_n: Float[Tensor, "2 3"], camera: Camera) -> Float[
     xy = foot[:, None] + along[:, None] * steps[:, None]
     uv, valid = camera.project(torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1))
     return torch.where(valid[..., None], uv, torch.nan).numpy()
-
-
-def _draw(canvas: np.ndarray, polyline: np.ndarray, colour: tuple[int, int, int], thickness: int) -> None:
-    known = np.isfinite(polyline).all(axis=-1) & (np.abs(polyline) < 8 * max(canvas.shape)).all(axis=-1)
-    points = (polyline[known] * (1 << _SUBPIXEL_BITS)).round().astype(np.int32)
-    if len(points) > 1:
-        cv2.polylines(canvas, [points], False, colour, thickness, cv2.LINE_AA, _SUBPIXEL_BITS)
-
-
-def _dot(canvas: np.ndarray, uv: np.ndarray, colour: tuple[int, int, int], radius: int) -> None:
-    if np.isfinite(uv).all() and (np.abs(uv) < 8 * max(canvas.shape)).all():
-        centre = tuple((uv * (1 << _SUBPIXEL_BITS)).round().astype(int).tolist())
-        cv2.circle(canvas, centre, radius << _SUBPIXEL_BITS, colour, -1, cv2.LINE_AA, _SUBPIXEL_BITS)

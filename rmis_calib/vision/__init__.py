@@ -11,6 +11,8 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "ShaftDetections": ".shaft_lines",
         "ShaftDetector": ".shaft_lines",
         "draw_detections": ".overlay",
+        "draw_dot": ".overlay",
+        "draw_polyline": ".overlay",
         "draw_stages": ".stages",
         "load_segmenter": ".masks",
     },

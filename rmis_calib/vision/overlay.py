@@ -33,17 +33,17 @@ def draw_detections(
     weight = max(1, round(image.shape[1] / 640))
     if predicted_uv is not None:
         for line in predicted_uv:
-            _polyline(canvas, np.asarray(line, float), _PREDICTED_COLOUR, 1)
+            draw_polyline(canvas, np.asarray(line, float), _PREDICTED_COLOUR, 1)
     for rank in range(found.valid.shape[1] - 1, -1, -1):
         if not bool(found.valid[frame, rank]):
             continue
         colour = _EDGE_COLOURS[rank % len(_EDGE_COLOURS)]
         contours = found.contour_uv[frame, rank].double().cpu().numpy()
         for line in contours:
-            _polyline(canvas, line, (0, 0, 0), weight + 2)
+            draw_polyline(canvas, line, (0, 0, 0), weight + 2)
         for line in contours:
-            _polyline(canvas, line, colour, weight)
-        _polyline(canvas, contours.mean(0)[::2], colour, 1)
+            draw_polyline(canvas, line, colour, weight)
+        draw_polyline(canvas, contours.mean(0)[::2], colour, 1)
         _end(canvas, contours, found, frame, rank, weight)
         place = contours[0, contours.shape[1] // 2]
         text = f"{float(found.confidence[frame, rank]):.2f}"
@@ -58,20 +58,27 @@ def _end(canvas: np.ndarray, contours: np.ndarray, found: ShaftDetections, frame
     """A bar across the shaft where it ends, and a dot on the axis."""
     if not bool(found.end_valid[frame, rank]):
         return
-    _polyline(canvas, contours[:, -1], _END_COLOUR, weight)
+    draw_polyline(canvas, contours[:, -1], _END_COLOUR, weight)
     centre = found.end_uv[frame, rank].double().cpu().numpy()
-    cv2.circle(canvas, _fixed(centre), (weight + 2) << _SHIFT, _END_COLOUR, -1, cv2.LINE_AA, _SHIFT)
+    draw_dot(canvas, centre, _END_COLOUR, weight + 2)
 
 
 def _fixed(point: np.ndarray) -> tuple[int, int]:
     return round(float(point[0]) * (1 << _SHIFT)), round(float(point[1]) * (1 << _SHIFT))
 
 
-def _polyline(canvas: np.ndarray, points: np.ndarray, colour: tuple[int, int, int], weight: int) -> None:
+def draw_polyline(canvas: np.ndarray, points: np.ndarray, colour: tuple[int, int, int], weight: int) -> None:
+    """A line through (n, 2) raw px, drawn to a sixteenth of a pixel; NaN points, and far outside ones, break it."""
     limit = 4.0 * max(canvas.shape)
     for a, b in pairwise(points):
         if np.isfinite([a, b]).all() and np.abs([a, b]).max() < limit:
             cv2.line(canvas, _fixed(a), _fixed(b), colour, weight, cv2.LINE_AA, _SHIFT)
+
+
+def draw_dot(canvas: np.ndarray, uv: np.ndarray, colour: tuple[int, int, int], radius: int) -> None:
+    """A disc about a point in raw px; nothing where it is NaN or far outside."""
+    if np.isfinite(uv).all() and np.abs(uv).max() < 4.0 * max(canvas.shape):
+        cv2.circle(canvas, _fixed(uv), radius << _SHIFT, colour, -1, cv2.LINE_AA, _SHIFT)
 
 
 def _text(canvas: np.ndarray, text: str, place: tuple[int, int], colour: tuple[int, int, int]) -> None:
