@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rmis_calib.config import CalibrationConfig
@@ -158,8 +158,8 @@ def _solve_choice(
             solution = estimate(observations, config)
         else:
             solution = estimate_with_kinematics(observations, config, unknowns)
-            poses = _at_estimate(unknowns, poses, solution)
-            observations = assemble(recording, poses, views, choices, config)
+            poses, known = _at_estimate(unknowns, poses, solution)
+            observations = assemble(recording, poses, views, tuple(c.where(known) for c in choices), config)
     except InsufficientDataError as error:
         motions = _motions(recording, views, poses, choices, None)
         result = _insufficient(config, motions, str(error))
@@ -189,8 +189,10 @@ def _kinematic_unknowns(
     return KinematicUnknowns(recording, poses.frames, config.device)
 
 
-def _at_estimate(unknowns: KinematicUnknowns, poses: MotionPoses, solution: Solution) -> MotionPoses:
-    """The poses at the estimated joint and clock offsets."""
+def _at_estimate(
+    unknowns: KinematicUnknowns, poses: MotionPoses, solution: Solution
+) -> tuple[MotionPoses, Bool[Tensor, " m"]]:
+    """The poses at the estimated joint and clock offsets, and in which motions the log covers that time."""
     found = {name: solution.nuisances[name].value for name in ("joint_offset", "clock") if name in solution.nuisances}
     joint_offset = found.get("joint_offset", poses.rcm_s_end_mm.new_zeros(len(unknowns.columns)))
     return unknowns.motion_poses(poses.frames, joint_offset, float(found.get("clock", torch.zeros(1))))

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rmis_calib.geometry.rigid import rigid_inverse
@@ -90,11 +90,13 @@ class KinematicUnknowns:
             clock_derivative=(derivative @ self._velocity(clock_s)[..., None])[..., 0],
         )
 
-    def motion_poses(self, frames: np.ndarray, joint_offset: Float[Tensor, " j"], clock_s: float) -> MotionPoses:
-        """Poses of the motions at one set of offsets."""
-        readings, _ = self._readings(torch.tensor([clock_s], dtype=torch.float64))
+    def motion_poses(
+        self, frames: np.ndarray, joint_offset: Float[Tensor, " j"], clock_s: float
+    ) -> tuple[MotionPoses, Bool[Tensor, " m"]]:
+        """Poses of the motions at one set of offsets, and in which motions the log covers that time."""
+        readings, known = self._readings(torch.tensor([clock_s], dtype=torch.float64))
         arm_T_rcm, v, s_end, p_head = self._poses(readings[0] + joint_offset)
-        return MotionPoses(frames, arm_T_rcm, v, s_end, p_head)
+        return MotionPoses(frames, arm_T_rcm, v, s_end, p_head), known[0]
 
     def _poses(self, readings: Float[Tensor, "*batch j"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         instrument = self._kinematics.instrument(readings[..., self._split :])

@@ -34,6 +34,10 @@ class Choice:
     def taken(self) -> Bool[Tensor, " m"]:
         return self.candidate >= 0
 
+    def where(self, known: Bool[Tensor, " m"]) -> "Choice":
+        """This choice in the motions that are known, none in the others."""
+        return Choice(torch.where(known, self.candidate, -1), self.reversed & known)
+
     def same_as(self, other: "Choice") -> bool:
         return torch.equal(self.candidate, other.candidate) and torch.equal(self.reversed, other.reversed)
 

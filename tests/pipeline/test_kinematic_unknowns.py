@@ -62,7 +62,7 @@ def test_derivative_is_the_displacement_of_the_shaft(moving):
     here = unknowns.linearised(problem, zero, torch.zeros(1, dtype=torch.float64), sigma)
     for joint in range(len(sigma)):
         step = 1e-4 * torch.eye(len(sigma), dtype=torch.float64)[joint]
-        there = unknowns.motion_poses(poses.frames, step, 0.0)
+        there, _ = unknowns.motion_poses(poses.frames, step, 0.0)
         T, moved = here.arm_T_rcm[0], there.arm_T_rcm
         omega = matrix_to_rotvec((rigid_inverse(T) @ moved)[:, :3, :3])
         shift = (T[:, :3, :3].mT @ (moved - T)[:, :3, 3:])[..., 0]
@@ -74,6 +74,16 @@ def test_derivative_is_the_displacement_of_the_shaft(moving):
         torch.testing.assert_close(
             here.joint_derivative[0, :, :, joint], expected, atol=1e-3 * float(expected.abs().max()), rtol=0.0
         )
+
+
+def test_motions_outside_of_the_log_are_not_known(moving):
+    recording = rc.load_recording(moving, clock_offset_s=0.0)
+    poses = motion_poses(recording)
+    unknowns = KinematicUnknowns(recording, poses.frames, "cpu")
+    late_s = float(recording.joints.timestamps_s[-1] - recording.frame_times_s[poses.frames[-4]])
+    zero = torch.zeros(len(unknowns.columns), dtype=torch.float64)
+    _, known = unknowns.motion_poses(poses.frames, zero, late_s)
+    assert known.tolist() == [True] * (len(poses.frames) - 3) + [False] * 3
 
 
 def rc_problem(observations):

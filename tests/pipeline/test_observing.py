@@ -75,6 +75,12 @@ def test_first_choice_is_the_most_confident_with_a_known_direction():
     assert first_choice(detections([contour_points(*OURS)], [False])).candidate.tolist() == [-1]
 
 
+def test_a_motion_without_joints_has_no_candidate():
+    choice = first_choice(detections([contour_points(*OURS)], [True]))
+    assert choice.where(torch.tensor([True])).candidate.tolist() == [0]
+    assert choice.where(torch.tensor([False])).candidate.tolist() == [-1]
+
+
 def test_the_candidate_that_fits_the_kinematics_wins_over_confidence(predicted):
     choice = consistent_choice(detections([contour_points(*OTHER), contour_points(*OURS)], [True, True]), predicted)
     assert (choice.candidate.tolist(), choice.reversed.tolist()) == ([1], [False])
