@@ -66,30 +66,28 @@ def _read_bands(
     t: Float[Tensor, "b k p"],
     lateral: Float[Tensor, "b k 2 p"],
     offsets: Float[Tensor, "b k 2 d"],
-) -> tuple[Float[Tensor, "b k 2 p d 3"], Bool[Tensor, "b k 2 p"]]:
+) -> tuple[Float[Tensor, "3 b k 2 p d"], Bool[Tensor, "b k 2 p"]]:
     """Colours across each contour, from inside (first) to outside (last), and whether all of it is in the picture."""
-    outward = lateral.new_tensor([1.0, -1.0])[:, None, None]
-    y = lateral[..., None] + outward * offsets[:, :, :, None, :]
-    ideal = strips.points(t[:, :, None, :, None].expand_as(y), y)
-    colours, seen = picture.read(ideal)
-    return colours, seen.all(-1)
+    middle = strips.points(t[:, :, None].expand_as(lateral), lateral)
+    outward = torch.stack([strips.left, -strips.left], 2)
+    return picture.read_across(middle, outward, offsets)
 
 
-def _project(colours: Float[Tensor, "b k 2 p d 3"], use: Bool[Tensor, "b k 2 p"]) -> Float[Tensor, "b k 2 p d"]:
+def _project(colours: Float[Tensor, "3 b k 2 p d"], use: Bool[Tensor, "b k 2 p"]) -> Float[Tensor, "b k 2 p d"]:
     """Colours along the direction, unit length, that separates outside from inside of each contour."""
-    third = colours.shape[-2] // 3
-    contrast = colours[..., -third:, :].mean(-2) - colours[..., :third, :].mean(-2)
-    weight = use[..., None].to(colours.dtype)
-    direction = (contrast * weight).sum(-2)
-    direction = direction / direction.norm(dim=-1, keepdim=True).clamp(min=1e-6)
-    return torch.einsum("bkepdc,bkec->bkepd", colours, direction)
+    third = colours.shape[-1] // 3
+    contrast = colours[..., -third:].mean(-1) - colours[..., :third].mean(-1)
+    direction = (contrast * use).sum(-1)
+    direction = direction / direction.norm(dim=0).clamp(min=1e-6)
+    red, green, blue = colours * direction[..., None, None]
+    return red + green + blue
 
 
 def _steepest(profile: Float[Tensor, "b k 2 p d"]) -> tuple[Float[Tensor, "b k 2 p"], Float[Tensor, "b k 2 p"]]:
     """Place of the steepest rise, in profile steps from the middle, and the rise of a smoothed profile there."""
     size = profile.shape[-1]
-    kernel = profile.new_tensor([-1.0, -2.0, 0.0, 2.0, 1.0]) / 8
-    slope = profile.unfold(-1, 5, 1) @ kernel
+    near, wide = profile[..., 3:-1] - profile[..., 1:-3], profile[..., 4:] - profile[..., :-4]
+    slope = torch.add(wide, near, alpha=2) * (1 / 8)
     best = slope.argmax(-1, keepdim=True)
     inner = best.clamp(1, slope.shape[-1] - 2)
     before, here, after = (slope.gather(-1, inner + shift)[..., 0] for shift in (-1, 0, 1))
@@ -133,11 +131,10 @@ def fine(
     seen &= use
     profile = _project(colours, seen)
     blur = _mean_blur(profile, seen, offsets)
-    solve = step_estimator(offsets, blur)  # (b, k, 2, 5, d)
-    fit = torch.einsum("bkend,bkepd->bkepn", solve, profile)
-    height = fit[..., 1]
+    solve = step_estimator(offsets, blur)[..., 1:3, :]  # (b, k, 2, 2, d)
+    height, bell = (profile @ solve.mT).unbind(-1)
     usual = masked_median(height, seen)[..., None]
-    shift = -fit[..., 2] / height.clamp(min=1e-3)
+    shift = -bell / height.clamp(min=1e-3)
     limit = 2.5 * blur[..., None]
     valid = seen & (height > 0.3 * usual) & (height > 5e-3) & (shift.abs() < limit)
     outward = t.new_tensor([1.0, -1.0])[:, None]

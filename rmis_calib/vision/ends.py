@@ -45,9 +45,9 @@ def locate(
     contour = strips.contour(t)
     rows = torch.linspace(-0.5 * _REACH, 0.5 * _REACH, _ROWS, device=t.device)
     y = contour.mean(2)[:, :, None] + (contour[:, :, 0] - contour[:, :, 1])[:, :, None] * rows[:, None]
-    colours, seen = picture.read(strips.points(t[:, :, None].expand_as(y), y))  # (b, k, rows, n, 3)
+    colours, seen = picture.read(strips.points(t[:, :, None].expand_as(y), y))
     seen = seen.all(2)
-    profile = _separate(colours, seen)
+    profile = _separate(colours.movedim(0, -1), seen)
     index, rise, found = _first_rise(_darker_rows(profile), seen)
     shift, agreement = _refine(profile, index, (blur_px / step).clamp(0.5, 3.0))
     place = index.to(t.dtype) - _HALF + shift

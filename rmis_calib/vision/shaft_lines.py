@@ -116,7 +116,7 @@ class ShaftDetector:
                 masks = checked_masks(masks, images)
             found = search(images, self._canvas(images), self.settings, self.settings.max_shafts, masks)
             trace, scores, stages = found
-            return self._measure(images.contiguous(), trace, scores, stages, broken), stages
+            return self._measure(images, trace, scores, stages, broken), stages
 
     def _canvas(self, images: Tensor) -> Canvas:
         """The small picture's place, planned once for each size and device."""
