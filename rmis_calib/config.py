@@ -27,6 +27,10 @@ class CalibrationConfig:
     """Where images and estimation live: `cpu`, `cuda` or `cuda:N`."""
     batch_size: int = 8
     """Frames decoded, moved and detected together."""
+    masks: str | None = None
+    """Masks of one's own in place of the search by colour: a folder of pictures in the order of the frames, white on
+    shafts (for stereo two folders below it, `right` and `left`), or a TorchScript (.pt) or ONNX (.onnx) model from
+    pictures (b, 3, h, w) in [0, 1] to masks (b, h, w), above 0.5 on shafts."""
     measurements: tuple[Measurement, ...] = ("axis", "contours", "ends")
     """What the estimate may use of each picture; `heads` are the labelled head points, else kept for evaluation."""
     model_sigma_px: float = 0.3

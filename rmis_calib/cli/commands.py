@@ -134,7 +134,8 @@ class Evaluate:
 class Detect:
     """Find the instrument shaft: a table of lines, and pictures with what was found drawn in.
 
-    Writes OUT/lines.csv, OUT/lines.npz and OUT/overlays. Without a recording there is no camera: lines are in pixels.
+    Writes OUT/lines.csv, OUT/lines.npz and OUT/overlays; on request OUT/overlay_right.mp4 and OUT/debug. Without a
+    recording there is no camera: lines are in pixels.
     """
 
     source: tyro.conf.Positional[Path]
@@ -146,19 +147,36 @@ class Detect:
     overwrite: bool = False
     """Replace OUT if it exists."""
     overlays: int = -1
-    """Pictures drawn, spread over the frames (-1: every frame)."""
+    """Pictures drawn a camera, spread over the frames (-1: every frame)."""
+    overlay_video: bool = False
+    """Write the overlays of every frame as a video a camera, too."""
+    debug: bool = False
+    """Draw the stages of the search, a sheet a frame, to show why a frame failed."""
+    debug_frames: int = 40
+    """Most sheets of `--debug` a camera. Where there are more frames, only those without a shaft get one (-1: every
+    frame gets one)."""
     settings: Settings = field(default_factory=CalibrationConfig)
 
     def run(self) -> int:
         from rmis_calib.io import atomic_directory
         from rmis_calib.pipeline import detect
-        from rmis_calib.report import write_detection_folder
+        from rmis_calib.report import DetectionPictures, PictureChoice, write_lines
 
+        choice = PictureChoice(self.overlays, self.overlay_video, self.debug_frames if self.debug else 0)
         with atomic_directory(self.out, overwrite=self.overwrite) as folder, progress_reporter() as progress:
-            table = detect(self.source, self.settings, progress)
-            write_detection_folder(folder, table, self.overlays)
+            with DetectionPictures(folder, choice) as pictures:
+                table = detect(self.source, self.settings, progress, pictures.add)
+            write_lines(folder, table)
         print_table(f"shafts in {self.source}", table.rows())
-        console.print(f"lines: {self.out / 'lines.csv'}   pictures: {self.out / 'overlays'}")
+        console.print(f"lines: {self.out / 'lines.csv'}   pictures: {self.out / 'overlays'}", soft_wrap=True)
+        if self.overlay_video:
+            console.print(f"video: {self.out / 'overlay_right.mp4'}", soft_wrap=True)
+        if self.debug:
+            drawn, failed = pictures.sheets.total(), pictures.failed.total()
+            more = "" if drawn >= failed else "; --debug-frames -1 draws every frame"
+            console.print(
+                f"stages: {self.out / 'debug'} ({drawn} sheets; {failed} frames without a shaft{more})", soft_wrap=True
+            )
         return EXIT_OK
 
 

@@ -37,6 +37,7 @@ from rmis_calib.pipeline.observing import (
 from rmis_calib.pipeline.poses import MotionPoses, motion_poses
 from rmis_calib.results import STATUS_SENTENCES, CalibrationResult, Motions
 from rmis_calib.solver import Solution
+from rmis_calib.vision.masks import Segmenter
 
 JOINTS_UNKNOWN = "the joint log does not cover this time"
 TOO_FEW = "usable, but there are too few"
@@ -98,6 +99,7 @@ def calibrate(
     *,
     progress: Progress = no_progress,
     throw: bool = True,
+    segment: Segmenter | None = None,
 ) -> CalibrationResult:
     """Find `camera_right_T_arm` of a recording.
 
@@ -106,18 +108,22 @@ def calibrate(
         config: the defaults when None.
         progress: called with (stage, done, total).
         throw: raise when the result is not trustworthy; otherwise its `status` and `message` say so.
+        segment: maps pictures (b, 3, h, w) in [0, 1] to masks of shafts, in place of `config.masks`.
     Raises:
         CalibrationFailed: no trustworthy result (with `throw`); its `result` holds what there is.
         InputError, FileError: the recording breaks its format.
     """
-    result = run_calibration(recording, config, progress).result
+    result = run_calibration(recording, config, progress, segment).result
     if throw:
         raise_unless_trustworthy(result)
     return result
 
 
 def run_calibration(
-    recording: Recording, config: CalibrationConfig | None = None, progress: Progress = no_progress
+    recording: Recording,
+    config: CalibrationConfig | None = None,
+    progress: Progress = no_progress,
+    segment: Segmenter | None = None,
 ) -> CalibrationRun:
     """The whole calibration, keeping what each step made.
 
@@ -126,7 +132,7 @@ def run_calibration(
     config = config or CalibrationConfig()
     require_device(config.device)
     poses = motion_poses(recording, config.device)
-    views = detect_recording(recording, config, progress)
+    views = detect_recording(recording, config, progress, segment=segment)
     choices = tuple(first_choice(select_frames(view.detections, poses.frames)) for view in views)
     run = _solve_choice(recording, config, views, poses, choices, progress)
     for _ in range(CHOICE_ROUNDS - 1):

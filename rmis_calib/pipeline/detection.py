@@ -4,20 +4,53 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.geometry.cameras import Camera
-from rmis_calib.io import FrameSource, Recording, load_recording, open_source
+from rmis_calib.io import FrameBatch, FrameSource, Recording, load_recording, open_source
 from rmis_calib.pipeline.device import require_device
+from rmis_calib.pipeline.masks import MaskReader, open_masks
 from rmis_calib.vision import FrameReason, ShaftDetections, ShaftDetector
+from rmis_calib.vision.masks import Segmenter
 
 Progress = Callable[[str, int, int], None]
 
 
 def no_progress(stage: str, done: int, total: int) -> None:
     """The progress callback of callers who do not want one."""
+
+
+@dataclass(frozen=True, eq=False)
+class DetectedBatch:
+    """Frames with what was just found in them, for whoever draws them while they are in memory.
+
+    Attributes:
+        side: `right` or `left`.
+        source: all frames of that camera.
+        times_s: (N,) time of each of them; None where that is unknown.
+        detector: which found it.
+        frames: pictures and their numbers.
+        masks: (b, h, w) that took the place of the colour stage; None: none did.
+        detections: candidates, leading axis b.
+    """
+
+    side: str
+    source: FrameSource
+    times_s: np.ndarray | None
+    detector: ShaftDetector
+    frames: FrameBatch
+    masks: Tensor | None
+    detections: ShaftDetections
+
+
+Watch = Callable[[DetectedBatch], None]
+
+
+def no_watch(batch: DetectedBatch) -> None:
+    """The watcher of callers who do not want one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,12 +97,23 @@ class DetectionTable:
 
 
 def detect(
-    source: Recording | str | Path, config: CalibrationConfig | None = None, progress: Progress = no_progress
+    source: Recording | str | Path,
+    config: CalibrationConfig | None = None,
+    progress: Progress = no_progress,
+    watch: Watch = no_watch,
+    segment: Segmenter | None = None,
 ) -> DetectionTable:
     """Find the shaft in a recording, or in a bare video, folder of images or image (then in pixels).
 
+    Args:
+        source: what to look at.
+        config: the defaults when None.
+        progress: called with (stage, done, total).
+        watch: called with every batch of frames and what was found in it.
+        segment: maps pictures (b, 3, h, w) in [0, 1] to masks, in place of `config.masks`.
+
     Raises:
-        FileError: the source cannot be read.
+        FileError: the source, or `config.masks`, cannot be read.
         RecordingError: it is a recording that breaks its format.
     """
     config = config or CalibrationConfig()
@@ -77,32 +121,59 @@ def detect(
     if not isinstance(source, Recording) and (Path(source) / "recording.yaml").is_file():
         source = load_recording(source)
     if isinstance(source, Recording):
-        return DetectionTable(detect_recording(source, config, progress))
+        return DetectionTable(detect_recording(source, config, progress, watch, segment))
     frames = open_source(source)
-    return DetectionTable((_detect_view("right", frames, None, config, progress, "detecting"),))
+    masks = open_masks(segment or config.masks, {"right": frames}, config.device)
+    camera = _Camera("right", frames, frames.times_s, None, masks.get("right"), "detecting")
+    return DetectionTable((_detect_view(camera, config, progress, watch),))
 
 
-def detect_recording(recording: Recording, config: CalibrationConfig, progress: Progress) -> tuple[View, ...]:
+def detect_recording(
+    recording: Recording,
+    config: CalibrationConfig,
+    progress: Progress,
+    watch: Watch = no_watch,
+    segment: Segmenter | None = None,
+) -> tuple[View, ...]:
     """The right view, and the left one of a stereo recording."""
     rig = recording.stereo
-    views = [_detect_view("right", recording.right, rig.right, config, progress, "detecting, right")]
+    views = {"right": (recording.right, rig.right)}
     if recording.left is not None:
-        views.append(_detect_view("left", recording.left, rig.left, config, progress, "detecting, left"))
-    return tuple(views)
+        views["left"] = (recording.left, rig.left)
+    sources = {side: source for side, (source, _) in views.items()}
+    masks = open_masks(segment or config.masks, sources, config.device)
+    cameras = [
+        _Camera(side, source, recording.frame_times_s, camera, masks.get(side), f"detecting, {side}")
+        for side, (source, camera) in views.items()
+    ]
+    return tuple(_detect_view(camera, config, progress, watch) for camera in cameras)
 
 
-def _detect_view(
-    side: str, source: FrameSource, camera: Camera | None, config: CalibrationConfig, progress: Progress, stage: str
-) -> View:
-    moved = None if camera is None else camera.to(dtype=torch.float64, device=config.device)
+@dataclass(frozen=True, eq=False)
+class _Camera:
+    """What is known of one camera before its frames are decoded."""
+
+    side: str
+    source: FrameSource
+    times_s: np.ndarray | None
+    camera: Camera | None
+    masks: MaskReader | None
+    stage: str
+
+
+def _detect_view(view: _Camera, config: CalibrationConfig, progress: Progress, watch: Watch) -> View:
+    source = view.source
+    moved = None if view.camera is None else view.camera.to(dtype=torch.float64, device=config.device)
     detector = ShaftDetector(config.detector, moved)
     parts, done = [], 0
-    progress(stage, 0, source.count)
+    progress(view.stage, 0, source.count)
     for batch in source.batches(config.batch_size, config.device):
-        parts.append(detector.detect(batch.images))
+        masks = None if view.masks is None else view.masks(batch)
+        parts.append(detector.detect(batch.images, masks))
+        watch(DetectedBatch(view.side, source, view.times_s, detector, batch, masks, parts[-1]))
         done += len(batch.indices)
-        progress(stage, done, source.count)
-    return View(side, source, camera, concatenate(parts))
+        progress(view.stage, done, source.count)
+    return View(view.side, source, view.camera, concatenate(parts))
 
 
 def concatenate(parts: list[ShaftDetections]) -> ShaftDetections:

@@ -7,9 +7,11 @@ __getattr__, __dir__, __all__ = lazy_exports(
     {
         "DETECTED_RGB": ".overlays",
         "PREDICTED_RGB": ".overlays",
+        "DetectionPictures": ".detection_pictures",
         "Overlay": ".overlays",
+        "PictureChoice": ".detection_pictures",
         "write_calibration_folder": ".folder",
-        "write_detection_folder": ".folder",
+        "write_lines": ".folder",
         "write_report": ".page",
     },
 )

@@ -3,18 +3,17 @@
 import csv
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 
-from rmis_calib.errors import OutputError
 from rmis_calib.io.atomic import write_yaml
 from rmis_calib.pipeline.calibration import CalibrationRun
 from rmis_calib.pipeline.detection import DetectionTable, View
+from rmis_calib.report.detection_pictures import write_picture
 from rmis_calib.report.page import write_report
-from rmis_calib.report.pictures import overlays, spread
+from rmis_calib.report.pictures import overlays
 from rmis_calib.results import finite_or_none
-from rmis_calib.vision import FrameReason, draw_detections
+from rmis_calib.vision import FrameReason
 
 REPORT_PICTURES = 12
 """Pictures embedded in the page: enough to see every kind of view, few enough for a page of some 2 MB."""
@@ -41,7 +40,7 @@ def write_calibration_folder(folder: Path, run: CalibrationRun, count: int) -> N
     pictures = folder / "overlays"
     pictures.mkdir()
     for overlay in overlays(run, count):
-        _write_picture(pictures / f"{overlay.camera}_{overlay.frame:06d}.jpg", overlay.image)
+        write_picture(pictures / f"{overlay.camera}_{overlay.frame:06d}.jpg", overlay.image)
     per_view = max(1, REPORT_PICTURES // len(run.views))
     name = run.recording.path.resolve().name
     write_report(
@@ -53,13 +52,12 @@ def write_calibration_folder(folder: Path, run: CalibrationRun, count: int) -> N
     )
 
 
-def write_detection_folder(folder: Path, table: DetectionTable, count: int) -> None:
-    """lines.csv, lines.npz and overlays/*.jpg.
+def write_lines(folder: Path, table: DetectionTable) -> None:
+    """lines.csv and lines.npz.
 
     Args:
         folder: existing folder.
         table: what was detected.
-        count: pictures per camera; -1 for every frame.
     """
     with (folder / "lines.csv").open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)
@@ -72,17 +70,6 @@ def write_detection_folder(folder: Path, table: DetectionTable, count: int) -> N
         for name, value in vars(view.detections).items()
     }
     np.savez_compressed(folder / "lines.npz", allow_pickle=False, **arrays)
-    pictures = folder / "overlays"
-    pictures.mkdir()
-    for view in table.views:
-        for frame in spread(view.source.count, count):
-            image = view.source.frame(int(frame)).permute(1, 2, 0).cpu().numpy()
-            reason = FrameReason(int(view.detections.reason[frame]))
-            label = f"frame {frame}" + ("" if reason is FrameReason.OK else f": {reason.sentence}")
-            _write_picture(
-                pictures / f"{view.side}_{frame:06d}.jpg",
-                draw_detections(image, view.detections, int(frame), label=label),
-            )
 
 
 def _line_rows(view: View) -> list[list[object]]:
@@ -103,13 +90,3 @@ def _line_rows(view: View) -> list[list[object]]:
             direction = int(found.direction_known[frame, candidate])
             rows.append([view.side, frame, int(candidate), 1, "", confidence, direction, *values])
     return rows
-
-
-def _write_picture(path: Path, image_rgb: np.ndarray) -> None:
-    """A JPEG from RGB.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    if not cv2.imwrite(str(path), np.ascontiguousarray(image_rgb[..., ::-1])):
-        raise OutputError(where=str(path), expected="a place that can be written")

@@ -82,5 +82,12 @@ def draw_dot(canvas: np.ndarray, uv: np.ndarray, colour: tuple[int, int, int], r
 
 
 def _text(canvas: np.ndarray, text: str, place: tuple[int, int], colour: tuple[int, int, int]) -> None:
-    for shade, weight in (((0, 0, 0), 3), (colour, 1)):
-        cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, shade, weight, cv2.LINE_AA)
+    """Text on a darkened plate, which is legible on tissue, glare and black; moved into the picture where it is not."""
+    size = max(0.5, canvas.shape[1] / 1600)
+    (width, height), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
+    margin = round(8 * size)
+    left = int(np.clip(place[0], margin, max(margin, canvas.shape[1] - width - margin)))
+    base = int(np.clip(place[1], height + margin, max(height + margin, canvas.shape[0] - below - margin)))
+    plate = canvas[base - height - margin : base + below + margin // 2, left - margin : left + width + margin]
+    plate[:] = plate // 4
+    cv2.putText(canvas, text, (left, base), cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)

@@ -64,7 +64,9 @@ def search(
     lines = hough.refine(edges, hough.peaks(votes, _LINES))
     picture = strips.SmallPicture(torch.stack([unlike, seen.to(unlike.dtype), tone], 1), canvas, images.shape[-1])
     lines = hough.HoughLines(lines.normal, lines.rho * canvas.factor, lines.votes)
-    pairs = scoring.screen(picture, strips.pair(lines, picture, settings, _PAIRS), settings, _STRIPS)
+    # Masks have no texture: a strip that is too wide looks as good at a glance as the right one, so none is left out.
+    count_pairs = _STRIPS if masks is None else _PAIRS
+    pairs = scoring.screen(picture, strips.pair(lines, picture, settings, _PAIRS), settings, count_pairs)
     evidence = scoring.inspect(picture, pairs, settings)
     scores = scoring.score(evidence, settings)
     index, best = scoring.distinct(evidence, scores, count)

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from drawn_bars import draw_bar
 
-from rmis_calib.vision import ShaftDetector, draw_detections, draw_stages
+from rmis_calib.vision import ShaftDetector, draw_detections, draw_stage_sheet, draw_stages
 
 
 def test_an_overlay_marks_contours_and_leaves_the_rest() -> None:
@@ -36,3 +36,16 @@ def test_every_stage_has_a_picture() -> None:
     assert all(p.ndim == 3 and p.shape[2] == 3 and p.dtype == np.uint8 for p in pictures.values())
     # The strip's dots lie on the small picture of the bar.
     assert (pictures["7_strips"] != pictures["1_small"]).any()
+
+
+def test_a_sheet_names_the_stage_that_failed() -> None:
+    images = torch.cat([draw_bar(25.0).batch, torch.full((1, 3, 480, 640), 120, dtype=torch.uint8)])
+    found, stages = ShaftDetector().explain(images)
+    good, failed = (
+        draw_stage_sheet(images[i].permute(1, 2, 0).numpy(), found, stages, i, f"frame {i}") for i in range(2)
+    )
+    assert good.shape == failed.shape and good.dtype == np.uint8
+    amber = (failed == [255, 176, 0]).all(-1)
+    assert amber.sum() > 1000
+    # The frame lies about the third panel of the first row: a picture of one tone.
+    assert (amber.sum(0) > 100).argmax() > 2 * good.shape[1] // 4 - 10
