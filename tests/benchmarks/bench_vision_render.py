@@ -6,8 +6,9 @@ Contour error: rms distance, px, of the two reported points of either contour fr
 found when that is below 3 px for the best of the candidates; `first` counts it only when it is the first candidate.
 False: any candidate in a frame that shows no shaft at all. Stray: candidates further than 3 px from every true shaft,
 per frame. End: distance along the axis, median. Time is of detection alone, decoded pictures in, lines out: processor
-time of one thread for every method (so that other programs do not count), median. `x better` is the lowest ratio, over the peers, of the medians of the error on the frames that both
-found; peers that found under a tenth of the frames are left out. A peer may find any of the shafts in the picture.
+time of one thread for every method (so that other programs do not count), median. `x better` is the lowest ratio, over
+the peers, of the medians of the error on the frames that both found; peers that found under a tenth of the frames are
+left out. A peer may find any of the shafts in the picture.
 
 Three more tables: how far the confidence can be believed, what strong barrel distortion costs, and the goals.
 Frames are streamed: memory does not depend on their number. `--keep` leaves the recordings for the next run.
