@@ -24,7 +24,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rmis_calib.solver.measurements import Packed
+from rmis_calib.solver.measurements import LINE, Packed
 from rmis_calib.solver.normal import NoiseModel, image_variance, normal_equations
 from rmis_calib.solver.residuals import Shaft, State, _line_geometry, predict_shaft
 from rmis_calib.solver.soa import cross, dot, unit
@@ -80,11 +80,11 @@ def simulate(packed: Packed, state: State, noise: NoiseModel, draws: "_Draws", s
     M = cross(p, d)
     D = dot(M, M).sqrt()
     seen = Shaft(p=p, d=d, m=M / D, u=cross(d, M / D), D=D, s0=dot(p, d), head=_turned(shaft.head, phi))
-    f, n, _, _, n_xy = _line_geometry(packed, state, seen)
+    predicted = _line_geometry(packed, state, seen)
     sigma = sign * image_variance(packed, noise).sqrt()
-    lines = f.shape[0] * f.shape[1]
-    across = n[:2] / n_xy
-    line_xy = packed.line_xy + across * (sigma[:lines].view_as(f) * draws.line - f)
+    lines = packed.row_kind.count(LINE)
+    off = sigma[:lines].view_as(predicted.f) * draws.line - predicted.f
+    line_xy = torch.addcmul(packed.line_xy, predicted.n_image, off)
     turn = scaled(noise.kinematics_rad, draws.turn)
     simulated = replace(
         packed,

@@ -27,7 +27,7 @@ def motion_information(packed: Packed, state: State, layout: Layout, noise: Nois
     rows, shaft = linearise(packed, state)
     k, b, n = rows.r.shape
     system = torch.empty((k, k + layout.size, b, n), dtype=rows.r.dtype, device=rows.r.device)
-    covariance(rows.w, rows.a, image_variance(packed, noise), packed.row_camera, noise, system[:, :k])
+    covariance(rows.w, rows.a, image_variance(packed, noise), packed.cameras, noise, system[:, :k])
     system[:, k:] = columns(layout, rows, shaft, packed, state)
     eliminate(system)
     white = system[:, k:] * system.diagonal(dim1=0, dim2=1).permute(2, 0, 1).rsqrt()[:, None]

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from rmis_calib.errors import InputError
 from rmis_calib.solver.measurements import END, HEAD, LINE, Packed
-from rmis_calib.solver.residuals import State, linearise
+from rmis_calib.solver.residuals import Rows, State, linearise
 from rmis_calib.solver.soa import eliminate, forward_substitute
 from rmis_calib.solver.unknowns import Layout, columns
 
@@ -51,6 +51,7 @@ class Normal:
         rows: number of measured rows.
         distance2: r^T S^-1 r of each motion.
         factor: the eliminated systems, for `frozen_chi2`, when asked for.
+        linear: the rows that these are of, likewise.
     """
 
     H: Float[Tensor, "b p p"]
@@ -59,6 +60,7 @@ class Normal:
     rows: Float[Tensor, " b"]
     distance2: Float[Tensor, "b n"]
     factor: Tensor | None = None
+    linear: Rows | None = None
 
     @property
     def kept_factor(self) -> Tensor:
@@ -79,7 +81,7 @@ def covariance(
     w: Float[Tensor, "3 k b n"],
     a: Float[Tensor, "3 k b n"],
     image: Float[Tensor, "k b n"],
-    cameras: tuple[int, ...],
+    cameras: int,
     noise: NoiseModel,
     out: Float[Tensor, "k k b n"],
     weight: Float[Tensor, "c b n"] | None = None,
@@ -89,27 +91,36 @@ def covariance(
     Args:
         w, a: effects of a translation and a rotation of the shaft on each row (`residuals.Rows`).
         image: D.
-        cameras: camera of each row.
+        cameras: number of cameras; rows take turns between them.
     """
-    index = torch.tensor(cameras, device=out.device)
-    same = (index[:, None] == index[None]).to(out.dtype)[:, :, None, None]
-    seen_apart = bool((noise.camera_mm > 0).any()) or bool((noise.camera_rad > 0).any())
-    several = len(set(cameras)) > 1
-    scratch = torch.empty_like(out)
-    for vectors, shared, own, gram in (
-        (w, noise.kinematics_mm, noise.camera_mm, out),
-        (a, noise.kinematics_rad, noise.camera_rad, scratch),
-    ):
-        scaled = vectors * (shared if seen_apart and several else shared + own)[:, None]
-        torch.mul(scaled[0, :, None], vectors[0, None], out=gram)
-        for i in (1, 2):
-            gram.addcmul_(scaled[i, :, None], vectors[i, None])
-        if seen_apart and several:
-            gram.mul_(1.0 + same * (own / shared.clamp_min(1e-300))[:, None])
-    out.add_(scratch)
+    apart = cameras > 1 and bool(((noise.camera_mm > 0) | (noise.camera_rad > 0)).any())
+    shared_mm, shared_rad = noise.kinematics_mm, noise.kinematics_rad
+    if not apart:
+        shared_mm, shared_rad = shared_mm + noise.camera_mm, shared_rad + noise.camera_rad
+    _add_gram(out, w, shared_mm, first=True)
+    _add_gram(out, a, shared_rad)
+    if apart or weight is not None:
+        for c in range(cameras):
+            block = out[c::cameras, c::cameras]
+            if apart:
+                _add_gram(block, w[:, c::cameras], noise.camera_mm)
+                _add_gram(block, a[:, c::cameras], noise.camera_rad)
     out.diagonal(dim1=0, dim2=1).add_(image.permute(1, 2, 0))
     if weight is not None:
-        out.mul_(1.0 + same * (1.0 / weight[index] - 1.0)[:, None])
+        for c in range(cameras):
+            out[c::cameras, c::cameras].div_(weight[c])
+
+
+def _add_gram(
+    out: Float[Tensor, "k k b n"], vectors: Float[Tensor, "3 k b n"], variance: Float[Tensor, " b"], first: bool = False
+) -> None:
+    """Adds variance * vectors^T vectors of each motion to `out`; `first`: writes it."""
+    scaled = (vectors * variance[:, None]).unsqueeze(2).unbind()
+    for i, (left, right) in enumerate(zip(scaled, vectors.unbind(), strict=True)):
+        if first and i == 0:
+            torch.mul(left, right, out=out)
+        else:
+            out.addcmul_(left, right)
 
 
 def normal_equations(
@@ -119,18 +130,18 @@ def normal_equations(
 
     Args:
         weight: (c, b, n) in (0, 1] of each camera's measurements of a motion.
-        keep: also return the factor.
+        keep: also return the rows and the factor.
     """
     rows, shaft = linearise(packed, state)
     k, b, n = rows.r.shape
     p = layout.size
     augmented = torch.empty((k, k + p + 1, b, n), dtype=rows.r.dtype, device=rows.r.device)
-    covariance(rows.w, rows.a, image_variance(packed, noise), packed.row_camera, noise, augmented[:, :k], weight)
-    augmented[:, k:-1] = columns(layout, rows, shaft, packed, state)
+    covariance(rows.w, rows.a, image_variance(packed, noise), packed.cameras, noise, augmented[:, :k], weight)
+    columns(layout, rows, shaft, packed, state, out=augmented[:, k:-1])
     augmented[:, -1] = rows.r
     eliminate(augmented)
     pivots = augmented.diagonal(dim1=0, dim2=1).permute(2, 0, 1)  # (k, b, n)
-    white = augmented[:, k:] * pivots.rsqrt()[:, None]
+    white = augmented[:, k:].mul_(pivots.rsqrt()[:, None])
     gram = torch.matmul(white.permute(0, 2, 1, 3), white.permute(0, 2, 3, 1)).sum(0)  # (b, p + 1, p + 1)
     return Normal(
         H=gram[:, :p, :p],
@@ -138,7 +149,8 @@ def normal_equations(
         chi2=gram[:, p, p],
         rows=packed.rows_ok.sum((0, 2)).to(gram.dtype),
         distance2=white[:, -1].square().sum(0),
-        factor=augmented[:, :k].clone() if keep else None,
+        factor=augmented[:, :k] if keep else None,
+        linear=rows if keep else None,
     )
 
 
@@ -179,36 +191,42 @@ def accumulate(
             part_weight = None if weight is None else weight[:, bs, ns]
             parts.append(normal_equations(packed.narrow(bs, ns), part_state, part_layout, part_noise, part_weight))
         per_trial.append(_joined(parts))
-    joined = Normal(
-        **{
-            name: torch.cat([getattr(part, name) for part in per_trial])
-            for name in ("H", "g", "chi2", "rows", "distance2")
-        }
-    )
-    return with_prior(joined, layout, state)
+    if len(per_trial) == 1:
+        return with_prior(per_trial[0], layout, state)
+    names = ("H", "g", "chi2", "rows", "distance2")
+    joined = {name: torch.cat([getattr(part, name) for part in per_trial]) for name in names}
+    return with_prior(replace(per_trial[0], **joined), layout, state)
 
 
 def _joined(parts: list[Normal]) -> Normal:
     """Parts of the motions of the same trials."""
+    if len(parts) == 1:
+        return parts[0]
     sums = {name: torch.stack([getattr(part, name) for part in parts]).sum(0) for name in ("H", "g", "chi2", "rows")}
-    return Normal(**sums, distance2=torch.cat([part.distance2 for part in parts], dim=-1))
+    return replace(parts[0], **sums, distance2=torch.cat([part.distance2 for part in parts], dim=-1))
 
 
 def camera_distance2(
-    packed: Packed, state: State, noise: NoiseModel
+    packed: Packed, state: State, noise: NoiseModel, rows: Rows | None = None
 ) -> tuple[Float[Tensor, "c b n"], Float[Tensor, "c b n"]]:
-    """Mahalanobis distance^2 of each camera's measurements of a motion on their own, and how many rows they are."""
-    rows, _ = linearise(packed, state)
-    image = image_variance(packed, noise)
-    distances, counts = [], []
-    for c in range(packed.cameras):
-        mine = torch.tensor([i for i, camera in enumerate(packed.row_camera) if camera == c], device=rows.r.device)
-        k = len(mine)
-        system = torch.empty((k, k + 1, *rows.r.shape[1:]), dtype=rows.r.dtype, device=rows.r.device)
-        covariance(rows.w[:, mine], rows.a[:, mine], image[mine], (c,) * k, noise, system[:, :k])
-        system[:, k] = rows.r[mine]
-        eliminate(system)
-        pivots = system.diagonal(dim1=0, dim2=1).permute(2, 0, 1)
-        distances.append((system[:, -1].square() / pivots).sum(0))
-        counts.append(packed.rows_ok[mine].sum(0).to(rows.r.dtype))
-    return torch.stack(distances), torch.stack(counts)
+    """Mahalanobis distance^2 of each camera's measurements of a motion on their own, and how many rows they are.
+
+    Args:
+        rows: linearised at this state, where they are known.
+    """
+    rows = linearise(packed, state)[0] if rows is None else rows
+    c, b, n = packed.cameras, packed.trials, packed.motions
+    k = rows.r.shape[0] // c
+
+    def apart(x: Tensor) -> Tensor:
+        """(*, k c, b, n) -> (*, k, c b, n): cameras as trials of their own."""
+        return x.unflatten(-3, (k, c)).flatten(-3, -2)
+
+    system = rows.r.new_empty((k, k + 1, c * b, n))
+    own = NoiseModel(**{name: value.repeat(c) for name, value in vars(noise).items()})
+    covariance(apart(rows.w), apart(rows.a), apart(image_variance(packed, noise)), 1, own, system[:, :k])
+    system[:, k] = apart(rows.r)
+    eliminate(system)
+    pivots = system.diagonal(dim1=0, dim2=1).permute(2, 0, 1)
+    distance2 = (system[:, -1].square() / pivots).sum(0)
+    return distance2.unflatten(0, (c, b)), apart(packed.rows_ok).sum(0).to(rows.r.dtype).unflatten(0, (c, b))

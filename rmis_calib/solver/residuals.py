@@ -48,7 +48,7 @@ from torch import Tensor
 
 from rmis_calib.geometry.rotations import rotvec_to_matrix
 from rmis_calib.solver.measurements import Packed
-from rmis_calib.solver.soa import batch_last, cross, dot, rotate, rotate_back, unit
+from rmis_calib.solver.soa import cross, dot, rotate_trials, unit
 
 MAX_SINE = 0.99
 """Clamp of r/D. A shaft nearer than that would touch the lens; only trial steps get there."""
@@ -145,13 +145,12 @@ class Rows:
     end: Float[Tensor, "k b n"]
 
 
-def camera_rotations(packed: Packed, state: State) -> tuple[Float[Tensor, "3 3 c b 1"], Float[Tensor, "3 c b 1"]]:
-    """`camera_T_camera_right` of the state, batch last."""
-    R, t = packed.camera_R, packed.camera_t
+def camera_poses(packed: Packed, state: State) -> tuple[Float[Tensor, "b c 3 3"], Float[Tensor, "b c 3"]]:
+    """`camera_T_camera_right` of the state."""
+    R, t = packed.camera_R.permute(3, 2, 0, 1), packed.camera_t.permute(2, 1, 0)
     if packed.cameras == 2:
-        R = torch.stack((R[:, :, 0], batch_last(state.stereo_R, 2)), dim=2)
-        t = torch.stack((t[:, 0], batch_last(state.stereo_t, 1)), dim=1)
-    return R[..., None], t[..., None]
+        R, t = torch.stack((R[:, 0], state.stereo_R), dim=1), torch.stack((t[:, 0], state.stereo_t), dim=1)
+    return R, t
 
 
 def rcm_axes(packed: Packed) -> tuple[Float[Tensor, "3 b n"], Float[Tensor, "3 b n"]]:
@@ -166,15 +165,16 @@ def rcm_axes(packed: Packed) -> tuple[Float[Tensor, "3 b n"], Float[Tensor, "3 b
 def predict_shaft(packed: Packed, state: State) -> Shaft:
     """The shaft in the frame of each camera."""
     arm_p, arm_v, arm_head = _corrected(packed, state)
-    R, t = batch_last(state.R, 2)[..., None], batch_last(state.t, 1)[..., None]
-    camera_R, camera_t = camera_rotations(packed, state)
-    p = rotate(camera_R, (rotate(R, arm_p) + t)[:, None]) + camera_t
-    d = rotate(camera_R, rotate(R, arm_v)[:, None])
+    camera_R, camera_t = camera_poses(packed, state)
+    R = camera_R @ state.R[:, None]
+    t = (camera_R @ state.t[:, None, :, None])[..., 0] + camera_t
+    p = rotate_trials(R, arm_p) + t.permute(2, 1, 0)[..., None]
+    d = rotate_trials(R, arm_v)
     M = cross(p, d)
     D = dot(M, M).sqrt().clamp_min(1e-9)
-    m = M / D
-    head = rotate(camera_R, rotate(R, arm_head)[:, None]) if packed.has_heads else d
-    return Shaft(p=p, d=d, m=m, u=cross(d, m), D=D, s0=dot(p, d), head=head)
+    s0 = dot(p, d)
+    head = rotate_trials(R, arm_head) if packed.has_heads else d
+    return Shaft(p=p, d=d, m=M / D, u=torch.addcmul(p, s0, d, value=-1.0) / D, D=D, s0=s0, head=head)
 
 
 def _corrected(packed: Packed, state: State) -> tuple[Tensor, Tensor, Tensor]:
@@ -199,7 +199,7 @@ def _corrected(packed: Packed, state: State) -> tuple[Tensor, Tensor, Tensor]:
 def residual_rows(packed: Packed, state: State) -> Float[Tensor, "k b n"]:
     """Residuals alone."""
     shaft = predict_shaft(packed, state)
-    parts = [_line_geometry(packed, state, shaft)[0].flatten(0, 1)]
+    parts = [_line_geometry(packed, state, shaft).f.flatten(0, 1)]
     if packed.has_ends:
         parts.append(_end_geometry(packed, state, shaft)[0])
     if packed.has_heads:
@@ -208,60 +208,104 @@ def residual_rows(packed: Packed, state: State) -> Float[Tensor, "k b n"]:
 
 
 def linearise(packed: Packed, state: State) -> tuple[Rows, Shaft]:
-    """Residuals with their effects of a rigid motion of the shaft."""
+    """Residuals with their effects of a rigid motion of the shaft.
+
+    n, m and u all lie across d, so d x n = cos(alpha) u - rho sin(alpha) m and d x u = -m: w and a of lines and ends
+    are combinations of the axes m, u and d, which alone are turned into `camera_right`.
+    """
     shaft = predict_shaft(packed, state)
-    f, n, kappa, kappa_s, _ = _line_geometry(packed, state, shaft)
-    w = -kappa * n
-    a = -kappa_s * cross(shaft.d[:, None], n)
-    parts: list[tuple[Tensor, ...]] = [(f, w, a, kappa * packed.line_rho, torch.zeros_like(f))]
+    camera_R, _ = camera_poses(packed, state)
+    m, u, d = _into_right(camera_R, torch.stack((shaft.m, shaft.u, shaft.d), dim=1)).unsqueeze(2).unbind(1)
+    lines, c = packed.line_xy.shape[1], packed.cameras
+    ends = c * packed.has_ends
+    shape = (lines * c + ends + 2 * c * packed.has_heads, *shaft.D.shape[1:])
+    r, radius, end = (shaft.D.new_zeros(shape) for _ in range(3))
+    w, a = (shaft.D.new_empty((3, *shape)) for _ in range(2))
+    seen, ok = _line_geometry(packed, state, shaft), packed.line_ok
+    part = slice(0, lines * c)
+    kappa, kappa_s = torch.where(ok, seen.kappa, 0.0), torch.where(ok, seen.kappa_s, 0.0)
+    r[part] = torch.where(ok, seen.f, 0.0).flatten(0, 1)
+    radius[part] = (kappa * packed.line_rho).flatten(0, 1)
+    for out, along_m, along_u in (
+        (w, -kappa * seen.cosine, -kappa * seen.sine),
+        (a, kappa_s * seen.sine, -kappa_s * seen.cosine),
+    ):
+        out = out[:, part].unflatten(1, (lines, c))
+        torch.mul(along_m, m, out=out).addcmul_(along_u, u)
     if packed.has_ends:
-        e, w, s, gain = _end_geometry(packed, state, shaft)
-        parts.append(tuple(x.unsqueeze(x.ndim - 3) for x in (e, w, s * cross(shaft.d, w), torch.zeros_like(e), -gain)))
+        part = slice(lines * c, lines * c + ends)
+        e, chi, s_end, gain = _end_geometry(packed, state, shaft)
+        gain = torch.where(packed.end_ok, gain, 0.0)
+        r[part], end[part] = torch.where(packed.end_ok, e, 0.0), -gain
+        torch.mul(-gain, d[:, 0], out=w[:, part]).addcmul_(gain * chi, u[:, 0])
+        torch.mul(-gain * chi * s_end, m[:, 0], out=a[:, part])
     if packed.has_heads:
-        e, w = _head_geometry(packed, shaft)
-        zero = torch.zeros_like(e)
-        parts.append((e, w, cross(shaft.head[:, None].expand_as(w), w), zero, zero))
-    camera_R, _ = camera_rotations(packed, state)
-    ok = packed.rows_ok
-
-    def joined(i: int, vector: bool) -> Tensor:
-        pieces = [
-            rotate_back(camera_R[:, :, None], part[i]).flatten(1, 2) if vector else part[i].flatten(0, 1)
-            for part in parts
-        ]
-        return torch.where(ok, torch.cat(pieces, dim=1 if vector else 0), 0.0)
-
-    return Rows(
-        r=joined(0, False), w=joined(1, True), a=joined(2, True), radius=joined(3, False), end=joined(4, False)
-    ), shaft
+        part = slice(lines * c + ends, None)
+        e, w_head = _head_geometry(packed, shaft)
+        both = torch.cat((w_head, cross(shaft.head[:, None].expand_as(w_head), w_head)), dim=1)
+        both = torch.where(packed.head_ok, _into_right(camera_R, both), 0.0)
+        r[part] = torch.where(packed.head_ok, e, 0.0).flatten(0, 1)
+        w[:, part], a[:, part] = both[:, :2].flatten(1, 2), both[:, 2:].flatten(1, 2)
+    return Rows(r=r, w=w, a=a, radius=radius, end=end), shaft
 
 
-def _line_geometry(packed: Packed, state: State, shaft: Shaft) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """f (l, c, b, n), the normal n (3, l, c, b, n), kappa, kappa s_X, and |n_xy|."""
-    x, y = packed.line_xy
+def _into_right(camera_R: Float[Tensor, "b c 3 3"], v: Float[Tensor, "3 m c b n"]) -> Float[Tensor, "3 m c b n"]:
+    """Vectors of each camera's frame turned into `camera_right`."""
+    back = camera_R.permute(1, 0, 3, 2).expand(v.shape[1], -1, -1, -1, -1).flatten(0, 2)
+    return torch.matmul(back, v.flatten(1, 3).transpose(0, 1)).transpose(0, 1).unflatten(1, v.shape[1:4])
+
+
+@dataclass(frozen=True)
+class LineGeometry:
+    """Residuals f of the line rows and what their derivatives consist of; all but `n_image` are (l, c, b, n).
+
+    Attributes:
+        f: signed distance of the measured point from the predicted line.
+        sine, cosine: rho sin(alpha) and cos(alpha).
+        kappa: effect of the touched point's motion along the normal; kappa_s: times its coordinate from the RCM.
+        n_image: the predicted line's direction across itself, unit, in the image (2, l, c, b, n).
+    """
+
+    f: Float[Tensor, "l c b n"]
+    sine: Float[Tensor, "l c b n"]
+    cosine: Float[Tensor, "l c b n"]
+    kappa: Float[Tensor, "l c b n"]
+    kappa_s: Float[Tensor, "l c b n"]
+    n_image: Float[Tensor, "2 l c b n"]
+
+
+def _line_geometry(packed: Packed, state: State, shaft: Shaft) -> LineGeometry:
+    x, y = packed.line_xy.unbind()
     sine = (packed.line_rho * (state.radius[:, None] / shaft.D)).clamp(-MAX_SINE, MAX_SINE)
     cosine = (1.0 - sine.square()).sqrt()
-    n = torch.addcmul(cosine * shaft.m[:, None], sine, shaft.u[:, None])
-    n_xy = (n[0].square() + n[1].square()).sqrt().clamp_min(1e-12)
-    f = (n[0] * x + n[1] * y + n[2]) / n_xy
-    X_u, X_m, X_d = (axis[0] * x + axis[1] * y + axis[2] for axis in (shaft.u, shaft.m, shaft.d))
-    kappa = (cosine * X_u - sine * X_m) / (shaft.D * cosine * n_xy)
-    return f, n, kappa, X_d / n_xy - kappa * shaft.s0, n_xy
+    n_image = torch.addcmul(cosine * shaft.m[:2, None], sine, shaft.u[:2, None])
+    n_xy = n_image.square().sum(0).sqrt().clamp_min(1e-12)
+    X_m, X_u, X_d = (_along(axis, x, y) for axis in (shaft.m, shaft.u, shaft.d))
+    f = torch.addcmul(cosine * X_m, sine, X_u) / n_xy
+    kappa = torch.addcmul(cosine * X_u, sine, X_m, value=-1.0) / (shaft.D * cosine * n_xy)
+    return LineGeometry(f, sine, cosine, kappa, X_d / n_xy - kappa * shaft.s0, n_image / n_xy)
+
+
+def _along(axis: Float[Tensor, "3 c b n"], x: Float[Tensor, "*l c b n"], y: Float[Tensor, "*l c b n"]) -> Tensor:
+    """Component of the rays (x, y, 1) along an axis."""
+    first, second, third = axis.unbind()
+    return torch.addcmul(torch.addcmul(third, first, x), second, y)
 
 
 def _end_geometry(packed: Packed, state: State, shaft: Shaft) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """e (c, b, n), w (3, c, b, n), s_e (c, b, n) and d e / d s_e without its sign."""
-    x, y = packed.end_xy
+    """e, chi, s_e and d e / d s_e without its sign, all (c, b, n)."""
+    x, y = packed.end_xy.unbind()
     u, d, m = shaft.u, shaft.d, shaft.m
-    X_u, X_d = (axis[0] * x + axis[1] * y + axis[2] for axis in (u, d))
+    X_u, X_d = _along(u, x, y), _along(d, x, y)
     X_u = torch.where(X_u.abs() < MIN_COSINE, MIN_COSINE, X_u)
     chi = X_d / X_u
-    m_xy = (m[0].square() + m[1].square()).sqrt().clamp_min(1e-12)
-    along = (-m[1] / m_xy, m[0] / m_xy)
-    slope = ((d[0] - chi * u[0]) * along[0] + (d[1] - chi * u[1]) * along[1]).abs().clamp_min(1e-12) / X_u.abs()
-    s_end = packed.s_end + state.end_offset[:, None] + torch.zeros_like(chi)
-    gain = 1.0 / (shaft.D * slope)
-    return (chi - (shaft.s0 + s_end) / shaft.D) / slope, -gain * (d - chi * u), s_end, gain
+    image_m = m[:2]
+    m_xy = image_m.square().sum(0).sqrt().clamp_min(1e-12)
+    step = d[:2] - chi * u[:2]
+    across = torch.addcmul(step[1] * image_m[0], step[0], image_m[1], value=-1.0)
+    slope = (across / m_xy).abs().clamp_min(1e-12) / X_u.abs()
+    s_end = (packed.s_end + state.end_offset[:, None]).expand_as(chi)
+    return (chi - (shaft.s0 + s_end) / shaft.D) / slope, chi, s_end, (shaft.D * slope).reciprocal()
 
 
 def _head_geometry(packed: Packed, shaft: Shaft) -> tuple[Tensor, Tensor]:

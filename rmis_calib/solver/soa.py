@@ -11,22 +11,50 @@ from torch import Tensor
 
 def dot(a: Float[Tensor, "3 ..."], b: Float[Tensor, "3 ..."]) -> Tensor:
     """Scalar product over the first axis; the rest broadcasts."""
-    return torch.addcmul(torch.addcmul(a[0] * b[0], a[1], b[1]), a[2], b[2])
+    (a0, a1, a2), (b0, b1, b2) = a.unbind(), b.unbind()
+    return torch.addcmul(torch.addcmul(a0 * b0, a1, b1), a2, b2)
 
 
 def cross(a: Float[Tensor, "3 ..."], b: Float[Tensor, "3 ..."]) -> Float[Tensor, "3 ..."]:
     """Vector product over the first axis; the rest broadcasts."""
-    return torch.stack((a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]))
+    (a0, a1, a2), (b0, b1, b2) = a.unbind(), b.unbind()
+    return torch.stack(
+        (
+            torch.addcmul(a1 * b2, a2, b1, value=-1.0),
+            torch.addcmul(a2 * b0, a0, b2, value=-1.0),
+            torch.addcmul(a0 * b1, a1, b0, value=-1.0),
+        )
+    )
+
+
+def add_cross_(out: Float[Tensor, "3 ..."], a: Float[Tensor, "3 ..."], b: Float[Tensor, "3 ..."]) -> None:
+    """Adds a x b to `out`, in place; a and b broadcast."""
+    x, y, z = out.unbind()
+    (a0, a1, a2), (b0, b1, b2) = a.unbind(), b.unbind()
+    x.addcmul_(a1, b2).addcmul_(a2, b1, value=-1.0)
+    y.addcmul_(a2, b0).addcmul_(a0, b2, value=-1.0)
+    z.addcmul_(a0, b1).addcmul_(a1, b0, value=-1.0)
 
 
 def rotate(R: Float[Tensor, "3 3 ..."], v: Float[Tensor, "3 ..."]) -> Float[Tensor, "3 ..."]:
     """R v for matrices with the batch last."""
-    return torch.stack([torch.addcmul(torch.addcmul(R[i, 0] * v[0], R[i, 1], v[1]), R[i, 2], v[2]) for i in range(3)])
+    v0, v1, v2 = v.unbind()
+    turned = []
+    for row in R.unbind():
+        r0, r1, r2 = row.unbind()
+        turned.append(torch.addcmul(torch.addcmul(r0 * v0, r1, v1), r2, v2))
+    return torch.stack(turned)
 
 
 def rotate_back(R: Float[Tensor, "3 3 ..."], v: Float[Tensor, "3 ..."]) -> Float[Tensor, "3 ..."]:
     """R^T v for matrices with the batch last."""
     return rotate(R.transpose(0, 1), v)
+
+
+def rotate_trials(R: Float[Tensor, "b m 3 3"], v: Float[Tensor, "3 b n"]) -> Float[Tensor, "3 m b n"]:
+    """R v for m matrices a trial, the same for all its motions: one matrix product."""
+    m = R.shape[1]
+    return torch.matmul(R.transpose(1, 2).flatten(1, 2), v.transpose(0, 1)).transpose(0, 1).unflatten(0, (3, m))
 
 
 def unit(v: Float[Tensor, "3 ..."]) -> Float[Tensor, "3 ..."]:
@@ -46,9 +74,10 @@ def eliminate(augmented: Float[Tensor, "k cols b n"]) -> Float[Tensor, "k cols b
     hold L^-1 B of the right-hand sides B. So B^T S^-1 B = sum_j (L^-1 B)_j (L^-1 B)_j^T / d_j.
     """
     size = augmented.shape[0]
-    for j in range(size - 1):
-        augmented[j + 1 :, j].div_(augmented[j, j])
-        augmented[j + 1 :, j + 1 :].addcmul_(augmented[j + 1 :, j, None], augmented[j, None, j + 1 :], value=-1.0)
+    for j, pivot_row in enumerate(augmented.unbind()[: size - 1]):
+        below = augmented[j + 1 :]
+        factor = below[:, j].div_(pivot_row[j])
+        below[:, j + 1 :].addcmul_(factor.unsqueeze(1), pivot_row[j + 1 :], value=-1.0)
     return augmented
 
 

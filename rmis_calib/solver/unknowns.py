@@ -6,11 +6,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rmis_calib.errors import InputError
 from rmis_calib.solver.measurements import LINE, Packed
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.residuals import Rows, Shaft, State, rcm_axes
 from rmis_calib.solver.settings import NoiseSettings, UnknownSettings
-from rmis_calib.solver.soa import batch_last, cross, dot, rotate
+from rmis_calib.solver.soa import add_cross_, batch_last, dot, rotate
 
 UNITS = {
     "stereo_rotation": "rad",
@@ -175,39 +176,53 @@ def make_layout(
     return Layout(blocks, torch.cat(sigmas, dim=-1).clamp_min(1e-12), centre)
 
 
-def columns(layout: Layout, rows: Rows, shaft: Shaft, packed: Packed, state: State) -> Float[Tensor, "k p b n"]:
-    """Jacobian of the residuals, in the order of the layout's blocks (residuals.py derives it)."""
+def columns(
+    layout: Layout, rows: Rows, shaft: Shaft, packed: Packed, state: State, out: Float[Tensor, "k p b n"] | None = None
+) -> Float[Tensor, "k p b n"]:
+    """Jacobian of the residuals, in the order of the layout's blocks (residuals.py derives it).
+
+    Args:
+        out: where to write it.
+    """
+    if out is None:
+        out = rows.r.new_empty((rows.r.shape[0], layout.size, *rows.r.shape[1:]))
+    by_parameter = out.transpose(0, 1)  # (p, k, b, n)
     right_p = shaft.p[:, 0]
-    arm = right_p - batch_last(state.t, 1)[..., None]
-    out = torch.empty((rows.r.shape[0], layout.size, *rows.r.shape[1:]), dtype=rows.r.dtype, device=rows.r.device)
-    left = torch.tensor([c == 1 for c in packed.row_camera], device=rows.r.device)[:, None, None]
-    R = batch_last(state.R, 2)[..., None]
 
-    def put(name: str, values: Tensor) -> None:
-        out[:, layout.blocks[name]] = values
+    def turned(target: Tensor, lever: Tensor, w: Tensor, a: Tensor) -> None:
+        add_cross_(target.copy_(a), lever, w)
 
-    put("rotation", (cross(arm[:, None], rows.w) + rows.a).transpose(0, 1))
-    put("translation", rows.w.transpose(0, 1))
-    if "stereo_rotation" in layout.blocks:
-        put("stereo_rotation", torch.where(left, cross(right_p[:, None], rows.w) + rows.a, 0.0).transpose(0, 1))
-    if "stereo_translation" in layout.blocks:
-        put("stereo_translation", torch.where(left, rows.w, 0.0).transpose(0, 1))
+    turned(by_parameter[layout.blocks["rotation"]], right_p - state.t.T[..., None], rows.w, rows.a)
+    by_parameter[layout.blocks["translation"]] = rows.w
+    for name in ("stereo_rotation", "stereo_translation"):
+        if name in layout.blocks:  # rows alternate between the cameras: the left one's are every second
+            target = by_parameter[layout.blocks[name]].zero_()[:, 1::2]
+            if name == "stereo_rotation":
+                turned(target, right_p, rows.w[:, 1::2], rows.a[:, 1::2])
+            else:
+                target.copy_(rows.w[:, 1::2])
     if "radius" in layout.blocks:
-        put("radius", rows.radius[:, None])
+        by_parameter[layout.blocks["radius"]] = rows.radius
     if "end_offset" in layout.blocks:
-        put("end_offset", rows.end[:, None])
-    if "rcm_offset" in layout.blocks:
-        put("rcm_offset", torch.stack([dot(rows.w, rotate(R, e)[:, None]) for e in rcm_axes(packed)], dim=1))
-    if "joint_offset" in layout.blocks and packed.joint is not None:
-        put(
-            "joint_offset",
-            torch.stack([_effect(rows, R, packed.joint[:, j]) for j in range(packed.joint.shape[1])], dim=1),
-        )
-    if "clock" in layout.blocks and packed.clock is not None:
-        put("clock", _effect(rows, R, packed.clock)[:, None])
+        by_parameter[layout.blocks["end_offset"]] = rows.end
+    for name in ("rcm_offset", "joint_offset", "clock"):
+        if name in layout.blocks:
+            by_parameter[layout.blocks[name]] = _displaced(name, rows, packed, state)
     if EDGE_BIAS in layout.blocks:
-        put(EDGE_BIAS, _shifts(packed, rows.r))
+        out[:, layout.blocks[EDGE_BIAS]] = _shifts(packed, rows.r)
     return out
+
+
+def _displaced(name: str, rows: Rows, packed: Packed, state: State) -> Float[Tensor, "q k b n"]:
+    """Columns of the unknowns that move the shaft in `arm`."""
+    R = batch_last(state.R, 2)[..., None]
+    if name == "rcm_offset":
+        return torch.stack([dot(rows.w, rotate(R, e)[:, None]) for e in rcm_axes(packed)])
+    if packed.joint is not None and name == "joint_offset":
+        return torch.stack([_effect(rows, R, motion) for motion in packed.joint.unbind(1)])
+    if packed.clock is not None and name == "clock":
+        return _effect(rows, R, packed.clock)[None]
+    raise InputError(where=name, expected="derivatives of the kinematics", found="none")
 
 
 def _shifts(packed: Packed, like: Float[Tensor, "k b n"]) -> Float[Tensor, "k s b n"]:

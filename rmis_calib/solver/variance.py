@@ -137,7 +137,7 @@ def _score(
     """Score with respect to each variance, and the Fisher information."""
     k, b, n = rows.r.shape
     S = torch.empty((k, k, b, n), dtype=r.dtype, device=r.device)
-    covariance(rows.w, rows.a, image_variance(packed, noise), packed.row_camera, noise, S)
+    covariance(rows.w, rows.a, image_variance(packed, noise), packed.cameras, noise, S)
     inverse = _inverse(S.permute(2, 3, 0, 1))
     a, B = inverse @ r, inverse @ J
     H = (J.mT @ B).sum(1) + torch.diag_embed(layout.sigma.square().reciprocal())
