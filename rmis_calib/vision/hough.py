@@ -133,16 +133,20 @@ def refine(edges: EdgePixels, lines: HoughLines) -> HoughLines:
     Other edges that a line crosses point elsewhere and do not pull at it.
     """
     frames, count = lines.rho.shape
-    cosine, sine, rho = (value[edges.frame] for value in (lines.normal[..., 0], lines.normal[..., 1], lines.rho))
-    u, v = edges.uv[:, :1], edges.uv[:, 1:]
-    across = u * cosine + v * sine - rho  # (m, p)
-    on_line = across.abs() < _GATE_PX
-    on_line &= edges.normal[:, :1] * cosine + edges.normal[:, 1:] * sine > _AGREEMENT
-    edge, line = on_line.nonzero(as_tuple=True)  # few: an edge lies on one or two lines
-    t = edges.uv[edge, 1] * cosine[edge, line] - edges.uv[edge, 0] * sine[edge, line]
-    y, weight = across[edge, line], edges.weight[edge]
+    # Every edge against every line of its frame, as two small matrix products; rows pad frames with fewer edges.
+    size = torch.bincount(edges.frame, minlength=frames)
+    first = size.cumsum(0) - size
+    row = torch.arange(len(edges.frame), device=edges.frame.device) - first[edges.frame]
+    place = edges.uv.new_zeros(frames, max(1, int(size.max())), 5)
+    place[edges.frame, row] = torch.cat([edges.uv, -torch.ones_like(edges.uv[:, :1]), edges.normal], -1)
+    across = place[..., :3] @ torch.cat([lines.normal, lines.rho[..., None]], -1).mT  # (b, rows, p)
+    agreement = place[..., 3:] @ lines.normal.mT
+    frame, row, line = ((across.abs() < _GATE_PX) & (agreement > _AGREEMENT)).nonzero(as_tuple=True)  # few
+    edge, normal = first[frame] + row, lines.normal[frame, line]
+    t = edges.uv[edge, 1] * normal[:, 0] - edges.uv[edge, 0] * normal[:, 1]
+    y, weight = across[frame, row, line], edges.weight[edge]
     moments = torch.stack([weight, weight * t, weight * y, weight * t * t, weight * t * y], -1)
-    total = moments.new_zeros(frames * count, 5).index_add_(0, edges.frame[edge] * count + line, moments)
+    total = moments.new_zeros(frames * count, 5).index_add_(0, frame * count + line, moments)
     n, t, y, tt, ty = total.reshape(frames, count, 5).unbind(-1)
     n = n.clamp(min=1e-6)
     slope = ((ty - t * y / n) / (tt - t * t / n).clamp(min=1.0)).clamp(-0.06, 0.06)

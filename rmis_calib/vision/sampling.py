@@ -10,16 +10,18 @@ from torch.nn.functional import grid_sample
 from rmis_calib.vision.lens import Lens
 
 
-def sample(images: Float[Tensor, "b c h w"], uv: Float[Tensor, "b *points 2"]) -> Float[Tensor, "b *points c"]:
-    """Values of each picture at pixel coordinates; outside points read the border, so check `inside` as well.
+def sample(
+    layers: Float[Tensor, " c h w"], u: Float[Tensor, " *points"], v: Float[Tensor, " *points"]
+) -> Float[Tensor, " c *points"]:
+    """Values of each layer at pixel coordinates, bilinearly; points outside read the border.
 
     Convention: pixel (0, 0) is the centre of the top-left pixel.
     """
-    height, width = images.shape[-2:]
-    scale = uv.new_tensor([2.0 / max(width - 1, 1), 2.0 / max(height - 1, 1)])
-    flat = uv.reshape(uv.shape[0], 1, -1, 2) * scale - 1.0
-    values = grid_sample(images, flat.to(images.dtype), mode="bilinear", padding_mode="border", align_corners=True)
-    return values[:, :, 0].mT.reshape(*uv.shape[:-1], images.shape[1])
+    height, width = layers.shape[-2:]
+    place = torch.stack([u * (2.0 / max(width - 1, 1)) - 1.0, v * (2.0 / max(height - 1, 1)) - 1.0], -1)
+    place = place.reshape(1, 1, -1, 2)
+    values = grid_sample(layers[None], place, mode="bilinear", padding_mode="border", align_corners=True)
+    return values.reshape(layers.shape[0], *u.shape)
 
 
 def inside(

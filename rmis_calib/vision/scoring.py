@@ -76,7 +76,7 @@ def _profiles(picture: SmallPicture, strips: Strips, t: Float[Tensor, " s"], nar
     far = torch.stack([(0.2 * width).clamp(min=3 * unit), (0.4 * width).clamp(min=5 * unit)], -1)
     beyond_y = torch.cat([left[..., None] + far, right[..., None] - far], -1)
     lateral = torch.cat([inner_y, rim_y, beyond_y], -1)
-    value, seen, tone = picture.read(strips.points(stations[..., None].expand_as(lateral), lateral))
+    value, seen, tone = picture.read(strips, stations[..., None], lateral)
     rim, beyond = value[..., _INNER : _INNER + _RIM], value[..., _INNER + _RIM :]
     # The third darkest of seven: a glare stripe may cover half of the width.
     inner = value[..., :_INNER].kthvalue(3, -1).values
@@ -123,7 +123,7 @@ def screen(picture: SmallPicture, strips: Strips, settings: DetectorSettings, co
     near = (0.1 * width).clamp(min=2.0 * picture.factor)
     middle = 0.5 * (left + right)
     lateral = torch.stack([left + near, middle + 0.25 * width, middle, middle - 0.25 * width, right - near], -1)
-    value, seen, _ = picture.read(strips.points(stations[..., None].expand_as(lateral), lateral))
+    value, seen, _ = picture.read(strips, stations[..., None], lateral)
     inner = value[..., 1:4].amin(-1)
     left_rise = torch.where(seen[..., 0], value[..., 0] - inner, torch.inf)
     right_rise = torch.where(seen[..., 4], value[..., 4] - inner, torch.inf)

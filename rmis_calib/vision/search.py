@@ -35,10 +35,22 @@ class Stages:
     """Ideal pixel of the first small pixel."""
 
 
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Strips that may be shafts, the best first in each frame."""
+
+    trace: trace.Trace
+    """The kept ones as one list, (1, m)."""
+    keep: Bool[Tensor, "b c"]
+    """Which ranks of which frames are in the list; at least one."""
+    scores: Float[Tensor, "b c"]
+    """0 for none."""
+
+
 def search(
     images: Tensor, canvas: Canvas, settings: DetectorSettings, count: int, masks: Tensor | None = None
-) -> tuple[trace.Trace, Float[Tensor, "b c"], Stages]:
-    """The best `count` strips of each frame with their contours traced, their scores, and the stages that led there.
+) -> tuple[Found, Stages]:
+    """The best `count` strips of each frame with their contours traced, and the stages that led there.
 
     Args:
         images: (b, 3, H, W), uint8 or floating point in [0, 1].
@@ -62,7 +74,7 @@ def search(
     ridge, edges = _edges(unlike, well_inside)
     votes = hough.vote(edges, images.shape[0], canvas.half_diagonal_px / canvas.factor + 2)
     lines = hough.refine(edges, hough.peaks(votes, _LINES))
-    picture = strips.SmallPicture(torch.stack([unlike, seen.to(unlike.dtype), tone], 1), canvas, images.shape[-1])
+    picture = strips.SmallPicture(torch.stack([unlike, seen.to(unlike.dtype), tone]), canvas, images.shape[-1])
     lines = hough.HoughLines(lines.normal, lines.rho * canvas.factor, lines.votes)
     # Masks have no texture: a strip that is too wide looks as good at a glance as the right one, so none is left out.
     count_pairs = _STRIPS if masks is None else _PAIRS
@@ -70,10 +82,14 @@ def search(
     evidence = scoring.inspect(picture, pairs, settings)
     scores = scoring.score(evidence, settings)
     index, best = scoring.distinct(evidence, scores, count)
-    traced = trace.trace(picture, evidence.strips.pick(index), settings)
+    keep = best > 0
+    keep[0, 0] |= ~keep.any()  # an empty list would have no medians
+    traced = trace.trace(picture, evidence.strips.pick(index).listed(keep), settings)
     # Once more around lines through what was traced: the pair of Hough lines may have followed a short stretch only.
     traced = trace.trace(picture, trace.straighten(traced), settings)
-    return traced, best, Stages(rgb, seen, unlike, ridge, votes, lines, evidence, scores, canvas.factor, canvas.origin)
+    return Found(traced, keep, best), Stages(
+        rgb, seen, unlike, ridge, votes, lines, evidence, scores, canvas.factor, canvas.origin
+    )
 
 
 def _edges(

@@ -18,7 +18,7 @@ from rmis_calib.vision.masks import checked_masks
 from rmis_calib.vision.reasons import FrameReason
 from rmis_calib.vision.runs import masked_median, smooth_over
 from rmis_calib.vision.sampling import FullPicture
-from rmis_calib.vision.search import Stages, search
+from rmis_calib.vision.search import Found, Stages, search
 from rmis_calib.vision.settings import DetectorSettings
 from rmis_calib.vision.strips import Strips
 from rmis_calib.vision.trace import Trace
@@ -114,9 +114,8 @@ class ShaftDetector:
                 masks = self.segment(images.to(torch.float32) * scale)
             if masks is not None:
                 masks = checked_masks(masks, images)
-            found = search(images, self._canvas(images), self.settings, self.settings.max_shafts, masks)
-            trace, scores, stages = found
-            return self._measure(images, trace, scores, stages, broken), stages
+            found, stages = search(images, self._canvas(images), self.settings, self.settings.max_shafts, masks)
+            return self._measure(images, found, stages, broken), stages
 
     def _canvas(self, images: Tensor) -> Canvas:
         """The small picture's place, planned once for each size and device."""
@@ -140,15 +139,10 @@ class ShaftDetector:
         if camera is not None and tuple(camera.image_size) != size:
             raise ShapeError(where=where, expected=f"(height, width) of the camera, {camera.image_size}", found=size)
 
-    def _measure(
-        self, images: Tensor, found: Trace, scores: Float[Tensor, "b k"], stages: Stages, broken: Bool[Tensor, " b"]
-    ) -> ShaftDetections:
+    def _measure(self, images: Tensor, found: Found, stages: Stages, broken: Bool[Tensor, " b"]) -> ShaftDetections:
         """Sub-pixel contours, axis and end of the traced strips."""
-        keep = (scores > 0) & ~broken[:, None]
-        if not bool(keep.any()):
-            keep = torch.zeros_like(keep).index_fill(0, torch.tensor([0], device=keep.device), True)
-        picture = FullPicture(images, keep.nonzero()[:, 0][None], self.lens)
-        trace = found.listed(keep)
+        trace, keep, scores = found.trace, found.keep, found.scores
+        picture = FullPicture(images, trace.strips.frame, self.lens)
         points, fit = self._contours(picture, trace)
         strips = replace(trace.strips, offset=fit.offset, slope=fit.slope)
         floor = 5 * self.settings.sigma_floor_px
@@ -158,7 +152,7 @@ class ShaftDetector:
         confidence = _confidence(trace, fit, share, math.hypot(*images.shape[-2:]))
         convergence = (fit.slope[..., 0] - fit.slope[..., 1]).abs()
         cylinder = convergence < math.tan(math.radians(self.settings.max_convergence_deg))
-        clear = cylinder & (share > 0.15) & (scores[keep] > 0) & (fit.spread_t.amin(-1) > 0)
+        clear = cylinder & (share > 0.15) & ((scores > 0) & ~broken[:, None])[keep] & (fit.spread_t.amin(-1) > 0)
         valid = clear & (confidence >= self.settings.min_confidence)
         measured = self._assemble(trace, strips, points, fit, end, valid, confidence)
         reason = _reason(stages, scores, _spread(clear, keep), _spread(valid, keep), broken)

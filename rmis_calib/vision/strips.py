@@ -4,15 +4,15 @@ A strip has its own frame: station t along it, lateral y to the *left* of somebo
 points right and y down). Contours are y = offset + slope * t. All lengths are full-resolution ideal pixels.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from rmis_calib.vision.canvas import Canvas
 from rmis_calib.vision.hough import HoughLines
-from rmis_calib.vision.sampling import inside, sample
+from rmis_calib.vision.sampling import sample
 from rmis_calib.vision.settings import DetectorSettings
 
 
@@ -20,7 +20,7 @@ from rmis_calib.vision.settings import DetectorSettings
 class SmallPicture:
     """The small picture of a batch, and how to read it at full-resolution ideal pixels."""
 
-    layers: Float[Tensor, "b 3 h w"]
+    layers: Float[Tensor, "3 b h w"]
     """Unlikeness to a shaft; 1 inside the field of view, else 0; log brightness."""
     canvas: Canvas
     width_px: int
@@ -37,18 +37,39 @@ class SmallPicture:
         return self.canvas.half_diagonal_px
 
     def read(
-        self, ideal: Float[Tensor, "b *points 2"]
-    ) -> tuple[Float[Tensor, " b *points"], Bool[Tensor, " b *points"], Float[Tensor, " b *points"]]:
-        """Unlikeness at ideal points, whether they lie in the field of view, and log brightness."""
-        place = (ideal - ideal.new_tensor(self.canvas.origin)) / self.factor
-        values = sample(self.layers, place)
-        return values[..., 0], (values[..., 1] > 0.75) & inside(place, self.canvas.size, -0.5), values[..., 2]
+        self, strips: "Strips", t: Float[Tensor, "b k *#points"], y: Float[Tensor, "b k *#points"]
+    ) -> tuple[Float[Tensor, "b k *points"], Bool[Tensor, "b k *points"], Float[Tensor, "b k *points"]]:
+        """Unlikeness at (station, lateral) pairs, whether they lie in the field of view, and log brightness.
+
+        The frames lie below one another in one tall picture, so that strips of all of them are read in one call.
+        """
+        height, width = self.canvas.size
+        ones = [1] * (max(t.ndim, y.ndim) - 2)
+        first = (strips.origin - strips.origin.new_tensor(self.canvas.origin)) / self.factor
+        u, v = (
+            torch.addcmul(
+                torch.addcmul(origin.reshape(*origin.shape, *ones), t, along.reshape(*origin.shape, *ones)),
+                y,
+                left.reshape(*origin.shape, *ones),
+            )
+            for origin, along, left in zip(
+                first.unbind(-1),
+                (strips.along / self.factor).unbind(-1),
+                (strips.left / self.factor).unbind(-1),
+                strict=True,
+            )
+        )
+        near = (u >= -0.5) & (v >= -0.5) & (u <= width - 0.5) & (v <= height - 0.5)
+        v = v.clamp_(0, height - 1).add_(strips.frame.reshape(*strips.frame.shape, *ones) * height)
+        unlike, field, tone = sample(self.layers.flatten(1, 2), u, v)
+        return unlike, (field > 0.75).logical_and_(near), tone
 
 
 @dataclass(frozen=True, eq=False)
 class Strips:
-    """k candidate strips a frame."""
+    """k candidate strips a frame, or some strips of all frames as one list, (1, m)."""
 
+    frame: Int64[Tensor, "b k"]
     origin: Float[Tensor, "b k 2"]
     """Point of the middle line nearest to the centre of the picture."""
     along: Float[Tensor, "b k 2"]
@@ -81,12 +102,17 @@ class Strips:
         """The strips with these indices, (b, k') int64."""
         wide = index[..., None].expand(*index.shape, 2)
         return Strips(
+            frame=self.frame.gather(1, index),
             origin=self.origin.gather(1, wide),
             along=self.along.gather(1, wide),
             offset=self.offset.gather(1, wide),
             slope=self.slope.gather(1, wide),
             valid=self.valid.gather(1, index),
         )
+
+    def listed(self, keep: Bool[Tensor, "b k"]) -> "Strips":
+        """The kept strips of all frames as one list, (1, m)."""
+        return Strips(**{field.name: getattr(self, field.name)[keep][None] for field in fields(self)})
 
     def reverse(self, where: Bool[Tensor, "b k"]) -> "Strips":
         """The same strips walked the other way round where asked: left and right change places."""
@@ -100,7 +126,7 @@ class Strips:
 
 
 def pair(lines: HoughLines, picture: SmallPicture, settings: DetectorSettings, count: int) -> Strips:
-    """The `count` most voted pairs of lines that could be the contours of one cylinder.
+    """Up to `count` most voted pairs of lines that could be the contours of one cylinder.
 
     They face away from each other, converge little, and enclose a plausible width near the middle of the picture.
     """
@@ -121,5 +147,6 @@ def pair(lines: HoughLines, picture: SmallPicture, settings: DetectorSettings, c
     best = score.topk(min(count, score.shape[1]), dim=1)
     centre = width.new_tensor(picture.canvas.centre)
     middle = offset.mean(-1, keepdim=True)
-    strips = Strips(centre + middle * left, along, offset - middle, slope, score > 0)
-    return strips.pick(best.indices)
+    frame = torch.arange(score.shape[0], device=score.device)[:, None].expand_as(score)
+    strips = Strips(frame, centre + middle * left, along, offset - middle, slope, score > 0)
+    return strips.pick(best.indices[:, : max(1, int(strips.valid.sum(1).max()))])

@@ -4,7 +4,7 @@ The search for strips assumes straight lines; here each contour may wander by a 
 lens whose distortion nobody measured, or a bent shaft, does not lose the far end.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -70,12 +70,6 @@ class Trace:
     surround: Float[Tensor, "b k"]
     """How far the surroundings lie above the shaft's own tone."""
 
-    def listed(self, keep: Bool[Tensor, "b k"]) -> "Trace":
-        """The kept strips of all frames as one list, (1, m)."""
-        own = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("strips", "t")}
-        strips = Strips(**{name: value[keep][None] for name, value in vars(self.strips).items()})
-        return Trace(strips=strips, t=self.t, **{name: value[keep][None] for name, value in own.items()})
-
 
 @dataclass(frozen=True, eq=False)
 class _Sides:
@@ -97,9 +91,8 @@ def _follow(picture: SmallPicture, strips: Strips, stations: Float[Tensor, "b k 
     lateral = predicted[..., None] + reach * share  # (b, k, 2, s, o)
     outward = stations.new_tensor([1.0, -1.0])[:, None, None]
     both = torch.stack([lateral + near * outward, lateral - near * outward], -1)
-    at = stations[:, :, None, :, None, None].expand_as(both)
-    value, seen, tone = picture.read(strips.points(at, both))
-    rise = torch.where(seen.all(-1), value[..., 0] - value[..., 1], 0.0)
+    value, seen, tone = picture.read(strips, stations[:, :, None, :, None, None], both)
+    rise = (value[..., 0] - value[..., 1]) * seen.all(-1)
     best = (rise * torch.exp(-0.5 * (1.2 * share) ** 2)).argmax(-1, keepdim=True)
     place, step, outer = (v.gather(-1, best)[..., 0] for v in (lateral, rise, value[..., 0]))
     beside = tone[..., 0].gather(-1, best)[..., 0]
@@ -119,7 +112,7 @@ def _read_middle(picture: SmallPicture, strips: Strips, stations: Float[Tensor, 
     left, right = sides.lateral.unbind(2)
     across = left.new_tensor([-0.35, -0.233, -0.117, 0.0, 0.117, 0.233, 0.35, -0.85, 0.85])
     y = 0.5 * (left + right)[..., None] + (left - right)[..., None] * across
-    value, seen, tone = picture.read(strips.points(stations[..., None].expand_as(y), y))
+    value, seen, tone = picture.read(strips, stations[..., None], y)
     # The third darkest of seven: a glare stripe may cover half of the width and more.
     inner, brightness = (layer[..., :7].kthvalue(3, -1).values for layer in (value, tone))
     far = torch.where(seen[..., 7:], value[..., 7:], torch.inf).amin(-1)
