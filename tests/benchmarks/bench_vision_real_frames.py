@@ -7,12 +7,16 @@ every frame of the data set and in 15 frames of the real recording. They owe not
 enlarged pictures, each point then moved across the edge to half-way between the brightness of the shaft and that of the
 background (by eye where a highlight, a shadow or the picture's border spoils that; in colour difference for the
 defocused in-vivo shafts, whose own shadow darkens the tissue beside them), and each drawn on the enlarged picture and
-looked at again. `sigma_px` and `end_sigma_px` say how well each could be placed. Pixel centres are integers.
+looked at again. `sigma_px` and `end_sigma_px` say how well each could be placed; up to 1 px counts as sharp. Pixel
+centres are integers. In the recording the points lie above the first ball and the end is where the metal wrist begins.
 
 Kinds: `shaft` is to be found; `stub` is a shaft of which one contour shows for less than half a width, and its points
 lie on the metal tube of the same cylinder; `sleeve` is the tube around the shaft between the two balls of the
-recording, thicker than the shaft; `strut` is a black leg of furniture. Only a shaft can be missed, and only a detection that no
-label of any kind claims, or the second one on one label, is false.
+recording, thicker than the shaft; `strut` is a black leg of furniture, which no single picture tells from a shaft.
+
+Found is a label whose four points lie within 8 px of a detection's contours, closest pairs first, a detection for one
+label only. Of the other detections, `off` lies on a shaft that is not found (it is counted as missed), and `false` is
+where there is nothing to find. The end's distance is taken along the axis.
 """
 
 import argparse
@@ -30,7 +34,18 @@ ROOT = Path(__file__).resolve().parents[2]
 DATA = ROOT.parent / "shared" / "data"
 MATCH_PX = 8.0
 SHARP_PX = 1.0
-COUNTS = ("shaft", "shaft found", "stub", "stub found", "other", "other found", "false")
+COUNTS = (
+    "shaft",
+    "shaft found",
+    "stub",
+    "stub found",
+    "sleeve",
+    "sleeve found",
+    "strut",
+    "strut found",
+    "off",
+    "false",
+)
 
 
 def pictures() -> dict[tuple[str, str], np.ndarray]:
@@ -82,16 +97,35 @@ def match(found: ShaftDetections, labels: list[dict]) -> dict[int, tuple[int, np
     return claimed
 
 
+def end_error_px(found: ShaftDetections, rank: int, label: dict) -> float:
+    """Distance of the detected end from the labelled one along the labelled axis."""
+    direction = (label["contours"][:, 1] - label["contours"][:, 0]).sum(0)
+    offset = found.end_uv[0, rank].double().numpy() - label["end"]
+    return abs(float(offset @ direction)) / float(np.linalg.norm(direction))
+
+
+def lies_on(found: ShaftDetections, rank: int, label: dict) -> bool:
+    """Whether the middle of a detection lies between the labelled contours."""
+    contours, centre = label["contours"], found.contour_xy[0, rank].double().numpy().mean((0, 1))
+    direction = contours[:, 1] - contours[:, 0]
+    normal = np.stack([direction[:, 1], -direction[:, 0]], -1)
+    sides = np.einsum("ei,ei->e", centre - contours[:, 0], normal) * np.einsum(
+        "ei,ei->e", contours[::-1].mean(1) - contours[:, 0], normal
+    )
+    return bool((sides > 0).all())
+
+
 def score(key: tuple[str, str], found: ShaftDetections, labels: list[dict], row: dict) -> list[str]:
     """Count one picture into its set's row; what a reader should look at."""
     claimed, name, remarks = match(found, labels), " ".join(key).strip(), []
+    missed = [label for i, label in enumerate(labels) if label["kind"] == "shaft" and i not in claimed]
     for i, label in enumerate(labels):
-        kind = "other" if label["kind"] in ("sleeve", "strut") else label["kind"]
+        kind = label["kind"]
         row[kind] += 1
         if i not in claimed:
-            if kind != "other":
+            if kind in ("shaft", "stub"):
                 reason = (
-                    FrameReason(int(found.reason[0])).name.lower() if not found.valid.any() else "no candidate there"
+                    FrameReason(int(found.reason[0])).name.lower() if not found.valid.any() else "no candidate fits"
                 )
                 remarks.append(f"missed {name}: {kind} at {label['contours'].mean((0, 1)).round()}, {reason}")
             continue
@@ -100,11 +134,12 @@ def score(key: tuple[str, str], found: ShaftDetections, labels: list[dict], row:
         if kind == "shaft":
             row["px" if label["sigma_px"] <= SHARP_PX else "soft px"].extend(px.ravel())
             if label["end"] is not None and bool(found.end_valid[0, rank]):
-                row["end px"].append(np.linalg.norm(found.end_uv[0, rank].double().numpy() - label["end"]))
+                row["end px"].append(end_error_px(found, rank, label))
     for k in set(torch.nonzero(found.valid[0]).flatten().tolist()) - {rank for rank, _ in claimed.values()}:
-        row["false"] += 1
+        verdict = "off" if any(lies_on(found, k, label) for label in missed) else "false"
+        row[verdict] += 1
         centre = found.contour_xy[0, k].double().numpy().mean((0, 1)).round()
-        remarks.append(f"false  {name}: at {centre}, confidence {float(found.confidence[0, k]):.2f}")
+        remarks.append(f"{verdict:6} {name}: at {centre}, confidence {float(found.confidence[0, k]):.2f}")
     return remarks
 
 
@@ -128,15 +163,13 @@ def main() -> None:
             name = key[0].replace("/", "_").rsplit(".", 1)[0] + ("_" + key[1] if key[1] else "")
             cv2.imwrite(str(options.overlays / f"{name}.png"), draw_detections(image, found)[..., ::-1])
     table["all"] = {k: sum((row[k] for row in table.values()), start=type(v)()) for k, v in table["all"].items()}
-    print(
-        "| set | shafts | found | missed | false | contour px, median | soft contours | end px, median | stubs | others |"
-    )
-    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+    print("| set | shafts | found | missed | off | false | contour px | soft contours | end px | stubs | struts |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     for name, row in table.items():
         median = " | ".join(f"{np.median(row[k]):.2f}" if row[k] else "-" for k in ("px", "soft px", "end px"))
-        found = f"{row['shaft']} | {row['shaft found']} | {row['shaft'] - row['shaft found']} | {row['false']}"
-        rest = f"{row['stub found']} of {row['stub']} | {row['other found']} of {row['other']}"
-        print(f"| {name} | {found} | {median} | {rest} |")
+        shafts, others = f"{row['shaft']} | {row['shaft found']}", f"{row['off']} | {row['false']}"
+        cut = f"{row['stub found']} of {row['stub']} | {row['strut found']} of {row['strut']}"
+        print(f"| {name} | {shafts} | {row['shaft'] - row['shaft found']} | {others} | {median} | {cut} |")
     print(*remarks, sep="\n")
 
 
