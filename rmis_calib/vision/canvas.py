@@ -10,9 +10,12 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample
+from torch.nn.functional import grid_sample, interpolate
 
 from rmis_calib.vision.lens import Lens
+
+_STRAIGHT = 0.2
+"""Displacement by the lens, small px at the picture's rim, that the search need not undo."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +66,8 @@ def plan_canvas(image_size: tuple[int, int], factor: int, lens: Lens, device: to
         [torch.stack(pair, -1) for pair in ((u, low), (u, reach[1] * high), (low, v), (reach[0] * high, v))]
     )
     ideal = lens.to_ideal(rim)
+    if bool(((ideal - rim).abs() < _STRAIGHT * factor).all()):
+        return Canvas(factor, (first, first), small, None, None)
     ideal = ideal[torch.isfinite(ideal).all(-1)]
     middle = ideal.new_tensor([0.5 * (first + r) for r in reach])
     span = 0.75 * ideal.new_tensor([r - first for r in reach])
@@ -85,24 +90,22 @@ def plan_canvas(image_size: tuple[int, int], factor: int, lens: Lens, device: to
 
 
 def shrink(images: Tensor, factor: int) -> Float[Tensor, "b c h w"]:
-    """Mean over blocks, in [0, 1], single precision; the remainder at right and below is cut.
+    """Smaller by a factor, to a whole byte, as single precision in [0, 1]; the remainder at right and below is cut.
 
-    From blocks of four and more, only every second row and column in turn is read (as rooks that do not threaten each
-    other): four times less memory traffic, and interlaced rows still count alike.
+    Each small pixel is a triangle-weighted mean over twice the side of its block, so that every row of an interlaced
+    picture counts alike and nothing is skipped. On bytes in the CPU's memory torch has a fast path (a third of the time
+    of a mean over blocks); rounding to whole bytes is below the noise of what they average.
 
     Args:
         images: (b, c, H, W), uint8 or floating point in [0, 1].
         factor: side of a block, px.
     """
-    scale = 1.0 / 255.0 if images.dtype == torch.uint8 else 1.0
-    height, width = images.shape[-2] // factor * factor, images.shape[-1] // factor * factor
-    cut = images[..., :height, :width]
-    if factor < 4:
-        values = cut.to(torch.float32)
-        return avg_pool2d(values, factor) * scale if factor > 1 else values * scale
-    total = images.new_zeros((*images.shape[:2], height // factor, width // factor), dtype=torch.float32)
-    half = factor // 2
-    for row in range(factor):
-        column = 2 * row + 1 if row < half else 2 * (row - half) if factor % 2 == 0 else (2 * row + 1) % factor
-        total += cut[..., row::factor, column::factor]
-    return total * (scale / factor)
+    size = (images.shape[-2] // factor, images.shape[-1] // factor)
+    cut = images[..., : size[0] * factor, : size[1] * factor]
+    if cut.dtype != torch.uint8:
+        cut = (cut * 255).round().clamp(0, 255).to(torch.uint8)
+    if cut.device.type != "cpu":
+        cut = cut.to(torch.float32)
+    if factor > 1:
+        cut = interpolate(cut, size=size, mode="bilinear", antialias=True)
+    return cut.to(torch.float32, memory_format=torch.contiguous_format).round_().mul_(1.0 / 255.0)

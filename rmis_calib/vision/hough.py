@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -60,22 +60,31 @@ def gradients(unlike: Float[Tensor, "b h w"]) -> tuple[Float[Tensor, "b h w"], F
 
 
 def thin(
-    magnitude: Float[Tensor, "b h w"], gu: Float[Tensor, "b h w"], gv: Float[Tensor, "b h w"]
-) -> Bool[Tensor, "b h w"]:
-    """Pixels whose gradient is the largest along its own direction (of four)."""
-    padded = pad(magnitude[:, None], (1, 1, 1, 1))[:, 0]
-    height, width = magnitude.shape[1:]
+    magnitude: Float[Tensor, "b h w"],
+    frame: Int64[Tensor, " m"],
+    row: Int64[Tensor, " m"],
+    column: Int64[Tensor, " m"],
+    gu: Float[Tensor, " m"],
+    gv: Float[Tensor, " m"],
+) -> Bool[Tensor, " m"]:
+    """Those of the listed pixels whose gradient is the largest along its own direction (of four).
 
-    def neighbour(du: int, dv: int) -> Tensor:
-        return padded[:, 1 + dv : 1 + dv + height, 1 + du : 1 + du + width]
+    Convention: a step ahead is one that goes to the right, or straight down.
 
-    flat, steep = gv.abs() < 0.4142 * gu.abs(), gu.abs() < 0.4142 * gv.abs()
-    rising = gu * gv > 0
-    ahead = torch.where(rising, neighbour(1, 1), neighbour(1, -1))
-    behind = torch.where(rising, neighbour(-1, -1), neighbour(-1, 1))
-    ahead = torch.where(flat, neighbour(1, 0), torch.where(steep, neighbour(0, 1), ahead))
-    behind = torch.where(flat, neighbour(-1, 0), torch.where(steep, neighbour(0, -1), behind))
-    return (magnitude >= ahead) & (magnitude > behind)
+    Args:
+        magnitude: of the gradient, at every pixel.
+        frame, row, column: the pixels.
+        gu: gradient there.
+        gv: gradient there.
+    """
+    width = magnitude.shape[2] + 2
+    padded = pad(magnitude, (1, 1, 1, 1)).flatten()
+    at = (frame * (magnitude.shape[1] + 2) + row + 1) * width + column + 1
+    right = gv.abs() < 0.4142 * gu.abs()
+    down = gu.abs() < 0.4142 * gv.abs()
+    ahead = torch.where(right, 1, torch.where(down, width, torch.where(gu * gv > 0, width + 1, 1 - width)))
+    here = padded[at]
+    return (here >= padded[at + ahead]) & (here > padded[at - ahead])
 
 
 def vote(edges: EdgePixels, frames: int, radius_px: float) -> Float[Tensor, "b angles rhos"]:

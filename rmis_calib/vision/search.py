@@ -98,11 +98,14 @@ def _edges(
     """Thin ridges of the gradient inside the field of view, in small pixels from the middle of the canvas."""
     gu, gv = hough.gradients(unlike)
     magnitude = torch.sqrt(gu * gu + gv * gv)
-    ridge = hough.thin(magnitude, gu, gv) & (magnitude > _MIN_GRADIENT) & well_inside
-    frame, row, column = ridge.nonzero(as_tuple=True)
-    at = (frame * unlike.shape[1] + row) * unlike.shape[2] + column
-    strength = magnitude.flatten()[at]
-    normal = torch.stack([gu.flatten()[at], gv.flatten()[at]], -1) / strength[:, None]
-    middle = strength.new_tensor([(unlike.shape[2] - 1) / 2, (unlike.shape[1] - 1) / 2])
-    uv = torch.stack([column, row], -1).to(strength.dtype) - middle
-    return ridge, hough.EdgePixels(frame, uv, normal, strength / (strength + 0.15))
+    strong = ((magnitude > _MIN_GRADIENT) & well_inside).flatten().nonzero()[:, 0]
+    height, width = unlike.shape[1:]
+    frame, row, column = strong // (height * width), strong // width % height, strong % width
+    gradient = torch.stack([gu.flatten()[strong], gv.flatten()[strong]], -1)
+    top = hough.thin(magnitude, frame, row, column, *gradient.unbind(-1)).nonzero()[:, 0]
+    ridge = torch.zeros_like(well_inside)
+    ridge.view(-1)[strong[top]] = True
+    strength = magnitude.flatten()[strong[top]]
+    middle = strength.new_tensor([(width - 1) / 2, (height - 1) / 2])
+    uv = torch.stack([column[top], row[top]], -1).to(strength.dtype) - middle
+    return ridge, hough.EdgePixels(frame[top], uv, gradient[top] / strength[:, None], strength / (strength + 0.15))

@@ -84,10 +84,10 @@ def field_of_view(
         the field, and the field without a rim of `margin` pixels along black borders.
     """
     height, width = rgb.shape[-2:]
-    lit = rgb.amax(1) > black_level
-    columns = torch.arange(width, device=rgb.device)
-    first = torch.where(lit, columns, width).amin(-1).to(torch.float32)
-    last = torch.where(lit, columns, -1).amax(-1).to(torch.float32)
+    lit = (rgb.amax(1) > black_level).to(torch.float32)
+    columns = torch.arange(width, device=rgb.device, dtype=torch.float32)
+    first = width - (lit * (width - columns)).amax(-1)
+    last = (lit * (columns + 1)).amax(-1) - 1
     rows = torch.arange(height, device=rgb.device)
     empty = lit.sum(-1) < 0.25 * width  # a row that only an interlaced or half-black line reaches is no picture
     top = torch.where(empty, height, rows).amin(-1)

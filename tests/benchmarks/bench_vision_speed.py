@@ -51,7 +51,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         config = dataclasses.replace(load_synth_config("davinci_720"), motions=max(options.batches))
         pictures, camera, _ = read_recording(write_recording(Path(folder) / "r", config))
-    images = torch.from_numpy(pictures).permute(0, 3, 1, 2).contiguous().to(device)
+    images = torch.from_numpy(pictures).to(device).permute(0, 3, 1, 2)  # channels last in memory, as decoded
     detector = ShaftDetector(camera=camera.to(device=device))
     print(
         f"{device}, {torch.get_num_threads()} torch threads, {cv2.getNumThreads()} OpenCV threads, {images.shape[2:]}"
