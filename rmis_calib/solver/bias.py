@@ -51,13 +51,14 @@ def _turned(v: Tensor, phi: Tensor) -> Tensor:
 
 
 class _Draws:
-    """Standard normal draws of one simulation, reused with the other sign."""
+    """Standard normal draws of one simulation, and the same with the other sign: trials of twice as many."""
 
     def __init__(self, packed: Packed, generator: torch.Generator) -> None:
         c, b, n = packed.cameras, packed.trials, packed.motions
 
         def draw(*shape: int) -> Tensor:
-            return torch.randn(*shape, b, n, generator=generator, dtype=packed.p.dtype, device=packed.p.device)
+            one = torch.randn(*shape, b, n, generator=generator, dtype=packed.p.dtype, device=packed.p.device)
+            return torch.cat((one, -one), dim=-2)
 
         self.turn, self.shift = draw(3), draw(3)
         self.camera_turn, self.camera_shift = draw(3, c), draw(3, c)
@@ -66,12 +67,12 @@ class _Draws:
         self.head = draw(2, packed.head_xy.shape[1])
 
 
-def simulate(packed: Packed, state: State, noise: NoiseModel, draws: "_Draws", sign: float) -> Packed:
+def simulate(packed: Packed, state: State, noise: NoiseModel, draws: "_Draws") -> Packed:
     """The measurements that the state and the measured kinematics predict, with noise of the model and these draws
     added."""
 
     def scaled(variance: Tensor, draw: Tensor) -> Tensor:
-        return sign * variance.sqrt()[:, None] * draw
+        return variance.sqrt()[:, None] * draw
 
     shaft = predict_shaft(packed, state)
     phi = scaled(noise.camera_rad, draws.camera_turn)
@@ -81,7 +82,7 @@ def simulate(packed: Packed, state: State, noise: NoiseModel, draws: "_Draws", s
     D = dot(M, M).sqrt()
     seen = Shaft(p=p, d=d, m=M / D, u=cross(d, M / D), D=D, s0=dot(p, d), head=_turned(shaft.head, phi))
     predicted = _line_geometry(packed, state, seen)
-    sigma = sign * image_variance(packed, noise).sqrt()
+    sigma = image_variance(packed, noise).sqrt()
     lines = packed.row_kind.count(LINE)
     off = sigma[:lines].view_as(predicted.f) * draws.line - predicted.f
     line_xy = torch.addcmul(packed.line_xy, predicted.n_image, off)
@@ -135,16 +136,17 @@ def expected_score(
     )
     for b0 in range(0, b, step_b):
         bs = slice(b0, min(b0 + step_b, b))
-        s, lay, nm = state.take(bs), layout.take(bs), noise.take(bs)
+        twice = torch.arange(bs.stop - bs.start, device=packed.p.device).repeat(2)
+        s, lay, nm = (x.take(bs).take(twice) for x in (state, layout, noise))
         for n0 in range(0, m, step_n):
             ns = slice(n0, min(n0 + step_n, m))
             part = picked.narrow(bs, ns)
-            part_weight = None if picked_weight is None else picked_weight[:, bs, ns]
+            both = part.take_trials(twice)
+            both_weight = None if picked_weight is None else picked_weight[:, bs, ns].index_select(1, twice)
             for _ in range(repeats):
-                draws = _Draws(part, generator)
-                for sign in (1.0, -1.0):
-                    normal = normal_equations(simulate(part, s, nm, draws, sign), s, lay, nm, part_weight)
-                    g[bs] += normal.g
-                    H[bs] += normal.H
+                simulated = simulate(both, s, nm, _Draws(part, generator))
+                normal = normal_equations(simulated, s, lay, nm, both_weight)
+                g[bs] += normal.g.unflatten(0, (2, -1)).sum(0)
+                H[bs] += normal.H.unflatten(0, (2, -1)).sum(0)
     scale = n / (m * repeats * 2.0)
     return ScoreBias(g * scale, H * scale)

@@ -52,10 +52,14 @@ def compete(
     outliers."""
     index = order[: settings.start_motions]
     sample = packed.take_motions(index)
-    R, t = _starts(problem, packed, settings)
-    first = _race(problem, sample, R[:, :1], t[:, :1], assumed, free, settings, robust=False)
+    if packed.has_contours:
+        R, t = contour_starts(sample, torch.nan_to_num(problem.radius_mm), all_kinds=False)
+    else:
+        R, t = (start[:, :1] for start in _starts(problem, packed, settings))
+    first = _race(problem, sample, R, t, assumed, free, settings, robust=False)
     if first.settled:
         return first.state, first.noise, False
+    R, t = _starts(problem, packed, settings)
     race = _race(problem, sample, R, t, assumed, free, settings, robust=False)
     state, noise = race.state, race.noise
     # A poor fit hides outliers where the noise levels are to be estimated: they are raised until it looks good.
@@ -125,7 +129,7 @@ def _race(
             refined = levenberg_marquardt(many, state, layout, noise, START_TOLERANCE, 3, weight)
         else:
             refined = levenberg_marquardt(many, state, layout, noise, START_TOLERANCE, START_ITERATIONS)
-        distance2, rows = camera_distance2(many, refined.state, noise)
+        distance2, rows = camera_distance2(many, refined.state, noise, refined.normal.linear)
         cost = truncated_cost(distance2, rows, settings.outlier_probability if robust else 1e-12)
         front = cheirality(many, refined.state, torch.ones_like(distance2, dtype=torch.bool)).view(-1, s)
         enough = front >= 0.9 * front.amax(1, keepdim=True)

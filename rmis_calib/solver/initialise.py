@@ -181,19 +181,22 @@ def seen_axes(packed: Packed, radius: Float[Tensor, " b"]) -> SeenAxes:
 
 
 def contour_starts(
-    packed: Packed, radius: Float[Tensor, " b"], reweightings: int = 0
+    packed: Packed, radius: Float[Tensor, " b"], reweightings: int = 0, all_kinds: bool = True
 ) -> tuple[Float[Tensor, "b s 3 3"], Float[Tensor, "b s 3"]]:
     """Starts from contours and, where measured, ends; s = 1 or 3. Needs `packed.has_contours`.
 
     Args:
         reweightings: rounds of least absolute deviations; 0 for least squares.
+        all_kinds: False for the most accurate one alone.
     """
     axes = seen_axes(packed, radius)
     v = packed.v[:, None].expand_as(axes.direction)
     arm_end = (packed.p + packed.s_end * packed.v)[:, None].expand_as(v)
-    kinds = [None]
+    kinds: list[float | None] = [None]
     if bool((axes.end_weight.sum((0, 2)) >= 3).all()):
         kinds += [0.0, DIRECTION_LENGTH_MM**2]
+    if not all_kinds:
+        kinds = kinds[-1:]
     starts = []
     for mix in kinds:
         weight = axes.weight if mix is None else axes.end_weight
@@ -223,9 +226,7 @@ def _correlate(
     a: Float[Tensor, "3 c b n"], b: Float[Tensor, "3 c b n"], weight: Float[Tensor, "c b n"]
 ) -> Float[Tensor, "b 3 3"]:
     """Weighted sum of a b^T."""
-    return torch.stack(
-        [torch.stack([(weight * a[i] * b[j]).sum((0, 2)) for j in range(3)], dim=-1) for i in range(3)], dim=-2
-    )
+    return ((weight * a).permute(1, 2, 0, 3) @ b.permute(1, 2, 3, 0)).sum(0)
 
 
 def _absolute_orientation(camera: Tensor, arm: Tensor, weight: Tensor, extra: Tensor) -> tuple[Tensor, Tensor]:

@@ -8,6 +8,7 @@ derive the one from the other, and counting both would claim information twice.
 """
 
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float
@@ -93,24 +94,26 @@ class Packed:
         cameras = tuple(range(self.cameras))
         return cameras * (self.line_xy.shape[1] + self.has_ends + 2 * self.has_heads)
 
-    @property
+    @cached_property
     def row_kind(self) -> tuple[int, ...]:
         """LINE, END or HEAD of each row."""
         c = self.cameras
         return (LINE,) * (self.line_xy.shape[1] * c) + (END,) * (c * self.has_ends) + (HEAD,) * (2 * c * self.has_heads)
 
-    @property
+    @cached_property
     def rows_ok(self) -> Bool[Tensor, "k b n"]:
         heads = self.head_ok.repeat(2, 1, 1) if self.has_heads else self.head_ok
         return torch.cat((self.line_ok.flatten(0, 1), self.end_ok, heads))
 
-    @property
+    @cached_property
     def rows_var(self) -> Float[Tensor, "k b n"]:
         heads = self.head_var.repeat(2, 1, 1) if self.has_heads else self.head_var
         return torch.cat((self.line_var.flatten(0, 1), self.end_var, heads))
 
     def narrow(self, trials: slice, motions: slice) -> "Packed":
         """The part of these trials and motions."""
+        if trials.indices(self.trials) == (0, self.trials, 1) and motions.indices(self.motions) == (0, self.motions, 1):
+            return self
         part = {}
         for field in fields(self):
             value = getattr(self, field.name)
@@ -138,15 +141,21 @@ class Packed:
                 part[field.name] = value[..., trial, motion][..., None]
         return replace(self, **part)
 
-    def repeat_trials(self, times: int) -> "Packed":
-        """Every trial `times` times, neighbours together."""
+    def take_trials(self, index: Tensor) -> "Packed":
+        """The trials `index`, in this order, repeated where it repeats them."""
         part = {}
         for field in fields(self):
             value = getattr(self, field.name)
             if value is not None:
                 dim = value.ndim - (1 if field.name in ("camera_R", "camera_t") else 2)
-                part[field.name] = value.repeat_interleave(times, dim=dim)
+                part[field.name] = value.index_select(dim, index)
         return replace(self, **part)
+
+    def repeat_trials(self, times: int) -> "Packed":
+        """Every trial `times` times, neighbours together."""
+        if times == 1:
+            return self
+        return self.take_trials(torch.arange(self.trials, device=self.p.device).repeat_interleave(times))
 
     def keep(self, camera_ok: Bool[Tensor, "c b n"]) -> "Packed":
         """Measurements of other cameras and motions marked as not measured."""

@@ -22,6 +22,8 @@ INITIAL_DAMPING = 1e-4
 NULL_RIDGE = 1e-13
 """Added to the unit diagonal of a scaled system: a direction that the data do not see at all would else take its step
 from rounding."""
+PREDICTION_MARGIN = 0.1
+"""A pass is saved only where the step after it is predicted to be this part of the tolerance."""
 MAX_DAMPING = 1e8
 """Past this no step goes downhill to the working precision: the loop has stalled."""
 
@@ -92,7 +94,7 @@ def levenberg_marquardt(
         chi2 = frozen_chi2(normal.kept_factor, residual_rows(packed, proposal)).sum(-1) + (
             prior_weight * deviation.square()
         ).sum(-1)
-        predicted = -(delta * normal.g).sum(-1) + damping * 0.0
+        predicted = -(delta * normal.g).sum(-1)
         accepted = running & possible & (chi2 < normal.chi2) & torch.isfinite(chi2)
         ratio = (normal.chi2 - chi2) / predicted.clamp_min(1e-300)
         damping = torch.where(accepted, damping * torch.where(ratio > 0.5, 0.1, 1.0), damping * 8.0).clamp_min(1e-12)
@@ -120,7 +122,8 @@ def polish(
     """Gauss-Newton passes over all motions, streaming, from a start within a few standard errors.
 
     A step is kept if the next pass finds the Newton decrement g^T H^-1 g smaller; else it is undone and a quarter of
-    it is tried.
+    it is tried. Steps shrink at least by the same ratio each time; one after which the next is predicted to be below
+    the tolerance is taken as the last, and saves the pass that would confirm it.
     """
     b, device = state.t.shape[0], state.t.device
     status = torch.full((b,), SolveStatus.MAX_ITERATIONS, dtype=torch.int64, device=device)
@@ -132,7 +135,7 @@ def polish(
         return normal, delta, solvable, -(delta * normal.g).sum(-1)
 
     normal, delta, solvable, decrement = evaluate(state)
-    running = torch.ones_like(status, dtype=torch.bool)
+    running, previous = torch.ones_like(status, dtype=torch.bool), torch.zeros_like(decrement)
     for _ in range(max_passes):
         bad = ~torch.isfinite(normal.chi2)
         status = torch.where(
@@ -141,6 +144,10 @@ def polish(
         done = running & solvable & ~bad & (decrement < tolerance**2)
         status = torch.where(done, SolveStatus.CONVERGED, status)
         running = running & solvable & ~bad & ~done
+        last = running & (decrement.square() < (PREDICTION_MARGIN * tolerance) ** 2 * previous)
+        if bool(last.any()):
+            state, normal = _settled(state, normal, layout, delta, last)
+            status, steps, running = torch.where(last, SolveStatus.CONVERGED, status), steps + last, running & ~last
         if not bool(running.any()):
             break
         proposal = state.moved(layout.step(torch.where(running[:, None], delta, 0.0)))
@@ -150,10 +157,19 @@ def polish(
         steps = steps + better
         normal = _where(better, new_normal, normal)
         delta = torch.where(better[:, None], new_delta, delta / 4.0)
+        previous = torch.where(better, decrement, 0.0)
         decrement = torch.where(better, new_decrement, decrement)
     else:
         status = torch.where(running & (decrement < tolerance**2), SolveStatus.CONVERGED, status)
     return Refined(state, normal, status, steps)
+
+
+def _settled(state: State, normal: Normal, layout: Layout, delta: Tensor, chosen: Tensor) -> tuple[State, Normal]:
+    """The chosen trials after their last step, by the quadratic model: no score is left, and chi^2 has fallen by the
+    decrement."""
+    step = torch.where(chosen[:, None], delta, 0.0)
+    g = torch.where(chosen[:, None], 0.0, normal.g)
+    return state.moved(layout.step(step)), replace(normal, g=g, chi2=normal.chi2 + (normal.g * step).sum(-1))
 
 
 def _where(chosen: Tensor, a: Normal, b: Normal) -> Normal:
