@@ -137,7 +137,7 @@ def expected_score(
     for b0 in range(0, b, step_b):
         bs = slice(b0, min(b0 + step_b, b))
         twice = torch.arange(bs.stop - bs.start, device=packed.p.device).repeat(2)
-        s, lay, nm = (x.take(bs).take(twice) for x in (state, layout, noise))
+        s, lay, nm = state.take(bs).take(twice), layout.take(bs).take(twice), noise.take(bs).take(twice)
         for n0 in range(0, m, step_n):
             ns = slice(n0, min(n0 + step_n, m))
             part = picked.narrow(bs, ns)

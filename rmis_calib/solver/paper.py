@@ -4,6 +4,8 @@ Paper, Algorithm 1: each camera gives an estimate of its own of the same unknown
 Eq. 8), and the two are averaged. Everything works on sums over motions (statistics.py).
 """
 
+from functools import lru_cache
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -11,7 +13,7 @@ from torch import Tensor
 from rmis_calib.geometry.rotations import chordal_mean, matrix_to_quat, project_to_so3, quat_to_matrix
 from rmis_calib.solver.initialise import solve_translation
 from rmis_calib.solver.problem import Problem
-from rmis_calib.solver.rotation_search import unvec, vec
+from rmis_calib.solver.rotation_search import unvec
 from rmis_calib.solver.statistics import LineStatistics, plane_normals
 
 QUATERNION_STEPS = 60
@@ -20,6 +22,7 @@ MAX_QUATERNION_STEP = 0.05
 Gauss-Newton steps leap from the wrong basin, into which the linear start falls at c = 0.5 already (164 degrees off), to
 the right one in about nine of ten trials; that is luck, and `global` does it by search."""
 QUATERNION_TOLERANCE = 1e-7
+MAX_QUATERNION_DAMPING = 1e3
 
 
 def linear_rotation(gram: Float[Tensor, "b 9 9"]) -> Float[Tensor, "b 3 3"]:
@@ -40,24 +43,14 @@ def linear_rotation(gram: Float[Tensor, "b 9 9"]) -> Float[Tensor, "b 3 3"]:
 
 
 def refine_quaternion(gram: Float[Tensor, "b 9 9"], R: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 3"]:
-    """Eqs. 14 to 17: minimise sum (n.R(q) v)^2 over the unit quaternion, the gradient by autograd.
+    """Eqs. 14 to 17: minimise sum (n.R(q) v)^2 over the unit quaternion.
 
-    The curvature is Gauss and Newton's on the tangent space of the unit sphere (a full autograd Hessian takes 100 times
-    as long for the same minimum); q is renormalised after each step, and a step that does not lower the cost is damped.
+    The gradient is analytic and the curvature Gauss and Newton's, both on the tangent space of the unit sphere; q is
+    renormalised after each step, and a step that does not lower the cost is damped.
     """
     q = matrix_to_quat(R)
     eye = torch.eye(4, dtype=q.dtype, device=q.device)
-
-    def evaluate(q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        with torch.enable_grad():
-            leaf = q.detach().requires_grad_(True)
-            r = vec(quat_to_matrix(leaf))
-            cost = ((r[:, None] @ gram)[:, 0] * r).sum(-1)
-            (gradient,) = torch.autograd.grad(cost.sum(), leaf)
-        J = _quaternion_jacobian(q)
-        return cost.detach(), gradient, 2.0 * J.mT @ gram @ J
-
-    cost, gradient, curvature = evaluate(q)
+    cost, gradient, curvature = quaternion_derivatives(gram, q)
     damping = torch.full_like(cost, 1e-9)
     for _ in range(QUATERNION_STEPS):
         radial = q[:, :, None] * q[:, None]
@@ -67,15 +60,13 @@ def refine_quaternion(gram: Float[Tensor, "b 9 9"], R: Float[Tensor, "b 3 3"]) -
         step = -torch.linalg.solve(system, (tangent @ gradient[..., None]))[..., 0]
         length = torch.linalg.vector_norm(step, dim=-1, keepdim=True)
         step = step * (MAX_QUATERNION_STEP / length.clamp_min(MAX_QUATERNION_STEP))
-        proposal = q + step
-        proposal = proposal / torch.linalg.vector_norm(proposal, dim=-1, keepdim=True)
-        new_cost, new_gradient, new_curvature = evaluate(proposal)
+        proposal = torch.nn.functional.normalize(q + step, dim=-1)
+        new_cost, new_gradient, new_curvature = quaternion_derivatives(gram, proposal)
         better = new_cost <= cost
-        if not bool((better & (step.abs().amax(-1) > QUATERNION_TOLERANCE)).any()) and bool(
-            (damping > 1e3).all() | better.all()
-        ):
-            break
+        moving = (step.abs().amax(-1) > QUATERNION_TOLERANCE) & (damping < MAX_QUATERNION_DAMPING)
         q = torch.where(better[:, None], proposal, q)
+        if not bool(moving.any()):
+            break
         cost = torch.where(better, new_cost, cost)
         gradient = torch.where(better[:, None], new_gradient, gradient)
         curvature = torch.where(better[:, None, None], new_curvature, curvature)
@@ -83,17 +74,34 @@ def refine_quaternion(gram: Float[Tensor, "b 9 9"], R: Float[Tensor, "b 3 3"]) -
     return quat_to_matrix(q)
 
 
-def _quaternion_jacobian(q: Float[Tensor, "b 4"]) -> Float[Tensor, "b 9 4"]:
-    """d vec(R(q)) / dq of the homogeneous form of R(q); on the tangent space of the sphere it is that of R."""
-    w, x, y, z = q.unbind(-1)
-    columns = torch.stack(
-        (
-            torch.stack((w, x, -y, -z)), torch.stack((z, y, x, w)), torch.stack((-y, z, -w, x)),
-            torch.stack((-z, y, x, -w)), torch.stack((w, -x, y, -z)), torch.stack((x, w, z, y)),
-            torch.stack((y, z, w, x)), torch.stack((-x, -w, z, y)), torch.stack((w, -x, -y, z)),
-        )
+def quaternion_derivatives(
+    gram: Float[Tensor, "b 9 9"], q: Float[Tensor, "b 4"]
+) -> tuple[Float[Tensor, " b"], Float[Tensor, "b 4"], Float[Tensor, "b 4 4"]]:
+    """Cost r^T M r of r = vec(R(q)) at unit q, its gradient, and its Gauss-Newton curvature.
+
+    The homogeneous form of R(q), which is R(q) on the unit sphere, is quadratic: its Jacobian J is linear in q, and
+    r = J q / 2 (Euler). So with P = J^T M J the cost is q^T P q / 4, the gradient P q and the curvature 2 P. Off the
+    tangent space of the sphere they differ from those of R(q / |q|), which has no slope there.
+    """
+    J = (q @ _quaternion_map(q.dtype, q.device)).unflatten(-1, (9, 4))
+    P = J.mT @ gram @ J
+    gradient = (P @ q[..., None])[..., 0]
+    return 0.25 * (q * gradient).sum(-1), gradient, 2.0 * P
+
+
+@lru_cache(maxsize=4)
+def _quaternion_map(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "4 36"]:
+    """d vec(R(q)) / dq of the homogeneous form, (9, 4) row by row, as a linear function of q = (w, x, y, z)."""
+    signs = (  # entry (row of vec(R), column): component of q, 1 to 4 for w to z, with its sign
+        (1, 2, -3, -4), (4, 3, 2, 1), (-3, 4, -1, 2),
+        (-4, 3, 2, -1), (1, -2, 3, -4), (2, 1, 4, 3),
+        (3, 4, 1, 2), (-2, -1, 4, 3), (1, -2, -3, 4),
     )  # fmt: skip
-    return 2.0 * columns.permute(2, 0, 1)
+    out = torch.zeros(4, 9, 4, dtype=dtype, device=device)
+    for i, row in enumerate(signs):
+        for j, component in enumerate(row):
+            out[abs(component) - 1, i, j] = 2.0 if component > 0 else -2.0
+    return out.flatten(1)
 
 
 def solve_paper(statistics: LineStatistics) -> tuple[Float[Tensor, "b c 3 3"], Float[Tensor, "b c 3"]]:
