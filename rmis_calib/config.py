@@ -39,7 +39,7 @@ class CalibrationConfig:
     the real recording of the tests the answer is 9.8 mm from the reference, with 0.3 px 3.6 mm, with 0.7 px 2.6 mm."""
     edge_bias_px: float = 0.03
     """Error of a contour point that every picture of a camera shares (lens model, edge detector), 1 sigma, px. It does
-    not average out: it enters the covariance, not the estimate. Up to 0.04 px was measured on rendered pictures."""
+    not average out, so each is an unknown with this prior. Up to 0.04 px was measured on rendered pictures."""
     clock_search_s: float = 3.0
     """With `solver.unknowns.clock`: clock offsets are searched this far to either side of the recording's own. Public
     recordings are off by up to 2.4 s."""

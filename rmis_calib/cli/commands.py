@@ -302,6 +302,10 @@ def result_rows(result: "CalibrationResult") -> list[tuple[str, str]]:
         if residual["median"] is not None:
             rows.append((f"residual, {kind.replace('_', ' ')}", f"median {residual['median']:.3g} {residual['unit']}"))
     for name, nuisance in result.nuisances.items():
+        if name.startswith(
+            "edge_bias"
+        ):  # eight numbers of a hundredth of a pixel; result.json and the report have them
+            continue
         sigma = "" if nuisance["sigma"] is None else f" +- {nuisance['sigma']:.2g}"
         held = " (held by its prior)" if nuisance.get("held") else ""
         rows.append((name.replace("_", " "), f"{nuisance['value']:.4g}{sigma} {nuisance['unit']}{held}"))

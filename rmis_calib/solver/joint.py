@@ -18,7 +18,6 @@ from rmis_calib.solver.residuals import State
 from rmis_calib.solver.robust import REJECTED, anneal, classify
 from rmis_calib.solver.settings import SolverSettings
 from rmis_calib.solver.stream import single_pass
-from rmis_calib.solver.systematic import systematic_covariance
 from rmis_calib.solver.unknowns import Layout, Nominal, initial_state, make_layout
 from rmis_calib.solver.variance import assumed_noise, estimate_components
 
@@ -163,10 +162,6 @@ def _finish(
     scaled = torch.nan_to_num(information * scale[:, :, None] * scale[:, None], posinf=0.0, neginf=0.0)
     inverse = torch.linalg.pinv(scaled, hermitian=True, rtol=1e-15)
     covariance = inverse * scale[:, :, None] * scale[:, None]
-    if bool((problem.noise.edge_bias > 0).any()):
-        covariance = covariance + systematic_covariance(
-            packed, state, layout, noise, covariance, problem.noise.edge_bias, settings.chunk, weight
-        )
     return JointFit(
         problem=problem,
         packed=packed,

@@ -209,6 +209,17 @@ def pack(problem: Problem, noise: NoiseSettings) -> Packed:
     )
 
 
+def line_points(problem: Problem) -> int:
+    """Line rows a camera has in the packed form: the points of both contours where any motion has them, else of the
+    axis."""
+    return 4 if bool(_contour_ok(problem).any()) else 2
+
+
+def _contour_ok(problem: Problem) -> Bool[Tensor, "b c n"]:
+    known = torch.isfinite(problem.contour_xy).all(-1).all(-1).all(-1) & problem.valid
+    return known & torch.isfinite(problem.radius_mm)[:, None, None]
+
+
 def _to_arm(arm_R_rcm: Tensor, displacement: Tensor) -> Tensor:
     """Rotation and translation parts of displacements, turned from `rcm` into `arm`."""
     return torch.cat((rotate(arm_R_rcm, displacement[:3]), rotate(arm_R_rcm, displacement[3:])))
@@ -217,8 +228,7 @@ def _to_arm(arm_R_rcm: Tensor, displacement: Tensor) -> Tensor:
 def _lines(problem: Problem, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Contour points where both contours were measured, else axis points; (2, l, c, b, n), rho, variance, measured."""
     axis_ok = torch.isfinite(problem.axis_xy).all(-1).all(-1) & problem.valid  # (b, c, n)
-    contour_ok = torch.isfinite(problem.contour_xy).all(-1).all(-1).all(-1) & problem.valid
-    contour_ok = contour_ok & torch.isfinite(problem.radius_mm)[:, None, None]
+    contour_ok = _contour_ok(problem)
     axis = problem.axis_xy.permute(4, 3, 1, 0, 2)  # (xy, point, c, b, n)
     axis_var = torch.where(torch.isfinite(problem.axis_sigma), problem.axis_sigma, image).square().transpose(0, 1)
     axis_ok = axis_ok.transpose(0, 1)

@@ -70,6 +70,7 @@ class State:
         rcm_offset: of the shaft's axis from the nominal RCM, along two directions across the axis, mm.
         joint_offset: in each joint's unit.
         clock: seconds added to the time at which the joints were read.
+        edge_bias: shift across its line that a line row of each camera has in every motion alike, normalised units.
     """
 
     R: Float[Tensor, "b 3 3"]
@@ -81,6 +82,7 @@ class State:
     rcm_offset: Float[Tensor, "b 2"]
     joint_offset: Float[Tensor, "b j"]
     clock: Float[Tensor, " b"]
+    edge_bias: Float[Tensor, "b l c"]
 
     def where(self, chosen: Tensor, other: "State") -> "State":
         """This state in the chosen trials, `other` elsewhere."""
@@ -109,6 +111,8 @@ class State:
         for name in ("radius", "end_offset", "clock"):
             if name in step:
                 changed[name] = getattr(self, name) + step[name][:, 0]
+        if "edge_bias" in step:
+            changed["edge_bias"] = self.edge_bias + step["edge_bias"].reshape(self.edge_bias.shape)
         return replace(self, **changed)
 
 
@@ -282,6 +286,8 @@ def _line_geometry(packed: Packed, state: State, shaft: Shaft) -> LineGeometry:
     n_xy = n_image.square().sum(0).sqrt().clamp_min(1e-12)
     X_m, X_u, X_d = (_along(axis, x, y) for axis in (shaft.m, shaft.u, shaft.d))
     f = torch.addcmul(cosine * X_m, sine, X_u) / n_xy
+    if bool((state.edge_bias != 0).any()):
+        f = f + state.edge_bias.permute(1, 2, 0)[..., None]
     kappa = torch.addcmul(cosine * X_u, sine, X_m, value=-1.0) / (shaft.D * cosine * n_xy)
     return LineGeometry(f, sine, cosine, kappa, X_d / n_xy - kappa * shaft.s0, n_image / n_xy)
 

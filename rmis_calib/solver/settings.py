@@ -61,6 +61,9 @@ class UnknownSettings:
     clock_sigma_s: NotNegative = 2.0
     """Prior of the clock offset about zero. Public recordings are off by up to 2.4 s; data that see the clock at all
     see it to milliseconds."""
+    edge_bias: bool = True
+    """Estimate the shift across its line that each line point has in every motion alike (an error of the lens model or
+    of the edge detector does not average out), where the observations name its prior (`sigma_edge_bias`)."""
     held_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.95
     """An unknown whose sigma the data do not bring below this part of its prior is reported as held."""
 

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rmis_calib.errors import InputError
-from rmis_calib.solver.measurements import LINE, Packed
+from rmis_calib.solver.measurements import LINE, Packed, line_points
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.residuals import Rows, Shaft, State, rcm_axes
 from rmis_calib.solver.settings import NoiseSettings, UnknownSettings
@@ -21,6 +21,7 @@ UNITS = {
     "rcm_offset": "mm",
     "joint_offset": "rad or mm",
     "clock": "s",
+    "edge_bias": "focal lengths",
 }
 """Unit of each nuisance block."""
 
@@ -28,9 +29,6 @@ UNITS = {
 TRANSLATION_SIGMA_MM = 2000.0
 """Prior of the hand-eye translation about zero: no arm is longer. It moves a translation of 200 mm known to 1 mm by
 5e-5 mm, and keeps one that the data cannot see within the operating theatre."""
-
-EDGE_BIAS = "edge_bias"
-"""Block of the shifts that `systematic.py` considers; never one of the unknowns."""
 
 
 @dataclass(frozen=True)
@@ -78,9 +76,8 @@ class Layout:
             "rcm_offset": state.rcm_offset - origin.rcm_offset,
             "joint_offset": state.joint_offset - origin.joint_offset,
             "clock": (state.clock - origin.clock)[:, None],
+            "edge_bias": (state.edge_bias - origin.edge_bias).flatten(1),
         }
-        if EDGE_BIAS in self.blocks:
-            deviation[EDGE_BIAS] = torch.zeros_like(self.sigma[:, self.blocks[EDGE_BIAS]])
         return torch.cat([deviation[name] for name in self.blocks], dim=-1), self.sigma.square().reciprocal()
 
 
@@ -95,6 +92,7 @@ class Nominal:
         stereo_mm, stereo_rad: given noise of the stereo extrinsics; NaN where unknown.
         joint_offset_sigma: prior of each joint offset (no joints: none can be estimated).
         joint_offset_at, clock_at: where the kinematics were evaluated.
+        edge_bias: prior of the shift of each line row; 0 where there is none.
     """
 
     stereo: Float[Tensor, "b 4 4"]
@@ -104,6 +102,7 @@ class Nominal:
     joint_offset_sigma: Float[Tensor, "b j"]
     joint_offset_at: Float[Tensor, "b j"]
     clock_at: Float[Tensor, " b"]
+    edge_bias: Float[Tensor, "b l c"]
 
     @classmethod
     def of(cls, problem: Problem) -> "Nominal":
@@ -118,6 +117,7 @@ class Nominal:
             joint_offset_sigma=sigma,
             joint_offset_at=torch.zeros_like(sigma) if problem.joint_offset_at is None else problem.joint_offset_at,
             clock_at=torch.zeros_like(problem.radius_mm) if problem.clock_at is None else problem.clock_at,
+            edge_bias=problem.noise.edge_bias[:, None, None].expand(-1, line_points(problem), problem.n_cameras),
         )
 
     def repeat(self, part: slice, times: int) -> "Nominal":
@@ -138,6 +138,7 @@ def initial_state(nominal: Nominal, R: Float[Tensor, "b 3 3"], t: Float[Tensor, 
         rcm_offset=zero[:, None].expand(-1, 2),
         joint_offset=torch.zeros_like(nominal.joint_offset_at),
         clock=zero,
+        edge_bias=torch.zeros_like(nominal.edge_bias),
     )
 
 
@@ -166,6 +167,8 @@ def make_layout(
         entries.append(("joint_offset", packed.joint.shape[1], nominal.joint_offset_sigma))
     if settings.clock and packed.clock is not None:
         entries.append(("clock", 1, torch.full_like(infinite, settings.clock_sigma_s)))
+    if settings.edge_bias:
+        entries.append(("edge_bias", origin.edge_bias[0].numel(), nominal.edge_bias.flatten(1)))
     entries = [entry for entry in entries if bool((entry[2] > 0).any())]
     blocks, sigmas, start = {}, [], 0
     for name, width, sigma in entries:
@@ -208,8 +211,8 @@ def columns(
     for name in ("rcm_offset", "joint_offset", "clock"):
         if name in layout.blocks:
             by_parameter[layout.blocks[name]] = _displaced(name, rows, packed, state)
-    if EDGE_BIAS in layout.blocks:
-        out[:, layout.blocks[EDGE_BIAS]] = _shifts(packed, rows.r)
+    if "edge_bias" in layout.blocks:
+        out[:, layout.blocks["edge_bias"]] = _shifts(packed, rows.r)
     return out
 
 

@@ -28,7 +28,7 @@ def scene(simulate):
     one = torch.full((1,), 0.05, dtype=torch.float64)  # an exact stereo pair would not be refined
     problem = replace(
         problem,
-        noise=replace(problem.noise, stereo_mm=one, stereo_rad=one),
+        noise=replace(problem.noise, stereo_mm=one, stereo_rad=one, edge_bias=1e-3 * one),
         joint_derivative=joint,
         clock_derivative=clock,
         joint_offset_sigma=torch.ones(1, 2, dtype=torch.float64),
@@ -111,7 +111,7 @@ def test_jacobian_of_every_unknown_equals_autodiff(scene):
     layout = make_layout(Nominal.of(problem), packed, state, settings.unknowns, settings.noise)
     assert list(layout.blocks) == [
         "rotation", "translation", "stereo_rotation", "stereo_translation", "radius", "end_offset", "rcm_offset",
-        "joint_offset", "clock",
+        "joint_offset", "clock", "edge_bias",
     ]  # fmt: skip
     exact = replace_measurements(packed, state)
     rows, shaft = linearise(exact, state)
