@@ -41,8 +41,6 @@ from rmis_calib.vision.masks import Segmenter
 
 JOINTS_UNKNOWN = "the joint log does not cover this time"
 TOO_FEW = "usable, but there are too few"
-CONTINUOUS_LOG_S = 0.2
-"""A log sampled more slowly is a list of poses, in which there is no velocity and so no clock to estimate."""
 CHOICE_ROUNDS = 3
 """Solves at most: a choice of candidates that has not settled by then alternates between equals."""
 
@@ -161,9 +159,9 @@ def _solve_choice(
     unknowns = _kinematic_unknowns(recording, poses, config)
     try:
         if unknowns is None:
-            solution = estimate(observations, config)
+            solution, notes = estimate(observations, config), ()
         else:
-            solution = estimate_with_kinematics(observations, config, unknowns)
+            solution, notes = estimate_with_kinematics(observations, config, unknowns)
             poses, known = _at_estimate(unknowns, poses, solution)
             observations = assemble(recording, poses, views, tuple(c.where(known) for c in choices), config)
     except InsufficientDataError as error:
@@ -173,7 +171,9 @@ def _solve_choice(
     progress("solving", 1, 1)
     motions = _motions(recording, views, poses, choices, solution)
     columns = () if unknowns is None else unknowns.columns
-    result = make_result(solution, motions, _residuals_px(recording, poses, solution, motions.used), config, columns)
+    result = make_result(
+        solution, motions, _residuals_px(recording, poses, solution, motions.used), config, columns, notes
+    )
     errors = head_point_errors(result, recording, poses)
     residuals = result.residuals | {
         f"head_{side}": residual_record(distance, "px", np.isfinite(distance))
@@ -188,9 +188,7 @@ def _kinematic_unknowns(
 ) -> KinematicUnknowns | None:
     """The kinematics as a function of joint and clock offsets, where these are asked for."""
     asked = config.solver.unknowns
-    intervals_s = np.diff(recording.joints.timestamps_s)
-    continuous = len(intervals_s) > 0 and float(np.median(intervals_s)) <= CONTINUOUS_LOG_S
-    if config.solver.method != "joint" or not (asked.joint_offsets or (asked.clock and continuous)):
+    if config.solver.method != "joint" or (asked.joint_offsets == "never" and not asked.clock):
         return None
     return KinematicUnknowns(recording, poses.frames, config.device)
 

@@ -15,7 +15,7 @@ from rmis_calib.results import STATUS_SENTENCES, CalibrationResult, Motions, Sta
 from rmis_calib.solver import Problem, Solution, SolveStatus
 from rmis_calib.solver import solve as solve_problem
 from rmis_calib.solver.relinearise import scan_clock
-from rmis_calib.solver.solution import MotionReason, Observability
+from rmis_calib.solver.solution import MotionReason, Nuisance, Observability
 
 COARSE_CLOCK_STEP_S, CLOCK_STEP_S = 0.1, 0.02
 """Spacing of the clock offsets that are tried, first everywhere, then near the best: motion hardly turns within
@@ -59,19 +59,21 @@ def estimate(observations: ShaftObservations, config: CalibrationConfig) -> Solu
 
 def estimate_with_kinematics(
     observations: ShaftObservations, config: CalibrationConfig, unknowns: KinematicUnknowns
-) -> Solution:
-    """The same with constant joint offsets, and the clock offset, among the unknowns of `joint`.
+) -> tuple[Solution, tuple[str, ...]]:
+    """The same with constant joint offsets, and the clock offset, among the unknowns of `joint`; and what was decided
+    about the offsets, in sentences.
 
-    An offset that the data cannot tell from the transform (its sigma stays at its prior) is held at zero in a second
-    solve: its prior would else be counted as uncertainty of a transform that absorbs it anyway.
+    With `auto` the offsets are left out in a second solve unless the data contradict a robot without any. An offset
+    that the data cannot tell from the transform (its sigma stays at its prior) is held at zero: its prior would else be
+    counted as uncertainty of a transform that absorbs it anyway.
     """
     base = _problem(observations, config).flatten_batch()
     asked = config.solver.unknowns
     sigma = unknowns.prior_sigma(asked)
-    if not asked.joint_offsets:
+    if asked.joint_offsets == "never":
         sigma = sigma * 0.0
     clock_s = sigma.new_zeros(1)
-    if asked.clock:
+    if asked.clock and unknowns.has_clock:
         clock_s = clock_s + _clock_start(base, unknowns, config.clock_search_s, sigma)
 
     def solve_with(sigma: torch.Tensor) -> Solution:
@@ -82,9 +84,51 @@ def estimate_with_kinematics(
         return solve_problem(start.take_trials(0), config.solver, kinematics=kinematics)
 
     solution = solve_with(sigma)
-    if "joint_offset" in solution.nuisances and bool(solution.nuisances["joint_offset"].held.any()):
-        solution = solve_with(torch.where(solution.nuisances["joint_offset"].held, HELD * sigma, sigma))
-    return solution
+    offsets = solution.nuisances.get("joint_offset")
+    if offsets is None:
+        return solution, ()
+    p = float(offsets.p_nominal)
+    if asked.joint_offsets == "auto" and not p < asked.joint_offset_p_value:
+        return solve_with(sigma * 0.0), (_without_offsets(offsets, unknowns.columns, p),)
+    if bool(offsets.held.any()):
+        solution = solve_with(torch.where(offsets.held, HELD * sigma, sigma))
+    return solution, (_with_offsets(offsets, unknowns.columns, p),)
+
+
+def _without_offsets(offsets: Nuisance, columns: tuple[str, ...], p: float) -> str:
+    """Why joint offsets were left out, and up to what size they would not show."""
+    seen = [
+        f"{column.rpartition('_')[0]} {3.0 * _shown(sigma, column):.2g} {_shown_unit(column)}"
+        for column, sigma, held in zip(columns, offsets.sigma.tolist(), offsets.held.tolist(), strict=True)
+        if not held
+    ]
+    if not seen:
+        return "Constant joint offsets cannot be told from the transform here, and are part of it."
+    return (
+        f"The data do not ask for constant joint offsets (p = {p:.2g}); up to 3 sigma they would not show: "
+        + ", ".join(seen)
+    )
+
+
+def _with_offsets(offsets: Nuisance, columns: tuple[str, ...], p: float) -> str:
+    """That joint offsets were estimated, and which are part of the transform instead."""
+    held = [
+        column.rpartition("_")[0] for column, is_held in zip(columns, offsets.held.tolist(), strict=True) if is_held
+    ]
+    sentence = f"The encoders have constant offsets (p = {p:.1g} for none): they are estimated"
+    return (
+        f"{sentence}; those of {', '.join(held)} cannot be told from the transform and are part of it"
+        if held
+        else sentence
+    )
+
+
+def _shown(value: float, column: str) -> float:
+    return float(np.rad2deg(value)) if column.endswith("_rad") else value
+
+
+def _shown_unit(column: str) -> str:
+    return "deg" if column.endswith("_rad") else "mm"
 
 
 def _clock_start(base: Problem, unknowns: KinematicUnknowns, reach_s: float, like: torch.Tensor) -> float:
@@ -121,8 +165,10 @@ def make_result(
     residuals: dict[str, dict[str, Any]],
     config: CalibrationConfig,
     joint_columns: tuple[str, ...] = (),
+    notes: tuple[str, ...] = (),
 ) -> CalibrationResult:
-    """The result of one solve (no trial batch); `joint_columns` name its joint offsets."""
+    """The result of one solve (no trial batch); `joint_columns` name its joint offsets, `notes` join what is said of
+    the data."""
     status, message = judge(solution)
     finite = bool(torch.isfinite(solution.camera_right_T_arm).all())
     covariance = solution.covariance.cpu().numpy()
@@ -134,7 +180,7 @@ def make_result(
         camera_right_T_arm=_transform("camera_right", "arm", solution.camera_right_T_arm) if finite else None,
         camera_left_T_camera_right=None if stereo is None else _transform("camera_left", "camera_right", stereo),
         covariance=covariance if np.isfinite(covariance).all() else None,
-        observability=observability_record(solution.observability()),
+        observability=observability_record(solution.observability(), notes),
         motions=motions,
         residuals=residuals,
         nuisances=_nuisance_records(solution, joint_columns),
@@ -202,11 +248,11 @@ def residual_record(by_motion: np.ndarray, unit: str, used: np.ndarray) -> dict[
     return {"unit": unit, "median": median, "rms": rms, "by_motion": by_motion}
 
 
-def observability_record(observability: Observability) -> dict[str, Any]:
+def observability_record(observability: Observability, notes: tuple[str, ...] = ()) -> dict[str, Any]:
     """What the data can and cannot see, as plain values."""
     return {
         "verdict": observability.verdict.value,
-        "sentences": [observability.sentence],
+        "sentences": [observability.sentence, *notes],
         "working_point_mm": list(observability.working_point_mm),
         "working_point_sigma_mm": observability.working_point_sigma_mm,
         "directions": [

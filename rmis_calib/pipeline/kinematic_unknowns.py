@@ -16,6 +16,8 @@ from rmis_calib.solver.settings import UnknownSettings
 
 _STEP = {"rad": 1e-5, "mm": 1e-3}
 """Steps of the central differences: their error, step^2 times a third derivative of order 1, is below rounding."""
+_CONTINUOUS_LOG_S = 0.2
+"""A log sampled more slowly is a list of poses, in which there is no velocity and so no clock to estimate."""
 _MOVES_MM = 1e-6
 """A joint whose unit step moves the shaft by less than this (the wrist's joints) has no offset that could be seen."""
 
@@ -39,6 +41,9 @@ class KinematicUnknowns:
         """`<arm>.<joint>_rad` or `_mm`: the joints whose offsets are unknowns, laparoscope first."""
         self._log = recording.joints.select(self.columns)
         self._times = recording.frame_times_s[frames] + recording.clock_offset_s
+        intervals_s = np.diff(self._log.timestamps_s)
+        self.has_clock = len(intervals_s) > 0 and float(np.median(intervals_s)) <= _CONTINUOUS_LOG_S
+        """Whether the log is continuous enough for a clock offset to mean anything."""
         self._device = device
         self._split = len(self._kinematics.laparoscope_joints)
         steps = [_STEP[column.rpartition("_")[2]] for column in self.columns]
@@ -87,7 +92,7 @@ class KinematicUnknowns:
             self.at(base, joint_offset, clock_s),
             joint_derivative=derivative,
             joint_offset_sigma=sigma.expand(len(clock_s), -1),
-            clock_derivative=(derivative @ self._velocity(clock_s)[..., None])[..., 0],
+            clock_derivative=(derivative @ self._velocity(clock_s)[..., None])[..., 0] if self.has_clock else None,
         )
 
     def motion_poses(
@@ -114,7 +119,7 @@ class KinematicUnknowns:
 
     def _velocity(self, clock_s: Float[Tensor, " b"]) -> Float[Tensor, "b m j"]:
         """Central difference over one sample interval of the log to either side, unit per second."""
-        step_s = float(np.median(np.diff(self._log.timestamps_s))) if len(self._log.timestamps_s) > 1 else 1.0
+        step_s = float(np.median(np.diff(self._log.timestamps_s)))
         return (self._readings(clock_s + step_s)[0] - self._readings(clock_s - step_s)[0]) / (2.0 * step_s)
 
     def _derivative(self, readings: Float[Tensor, "b m j"]) -> Float[Tensor, "b m 6 j"]:

@@ -137,9 +137,7 @@ def _shaped(solution: Solution, batch: torch.Size) -> Solution:
         if isinstance(value, dict):
             return {key: shaped(item) for key, item in value.items()}
         if isinstance(value, Nuisance):
-            return Nuisance(
-                shaped(value.value), shaped(value.sigma), value.unit, shaped(value.held), shaped(value.pull)
-            )
+            return replace(value, **{k: shaped(v) for k, v in vars(value).items() if isinstance(v, Tensor)})
         return value
 
     names = [name for name in vars(solution) if name not in ("sight", "history")]

@@ -23,6 +23,8 @@ from rmis_calib.solver.variance import COMPONENTS, assumed_noise
 
 MIN_CHEIRALITY = 0.5
 CHECKED_MOTIONS = 256
+SEEN_PART = 0.5
+"""Part of the prior's variance below which the data must bring a direction to count as seen by them."""
 MAX_CHI2_PER_DOF = 3.0
 """Past this the model is wrong (swapped cameras, another rig), and no larger noise level makes it right."""
 SHOWN_MOTIONS = 4096
@@ -166,8 +168,28 @@ def _nuisances(fit: JointFit, settings: SolverSettings) -> dict[str, Nuisance]:
             unit=UNITS[name],
             held=held,
             pull=deviation[:, part] / fit.layout.sigma[:, part],
+            p_nominal=_p_nominal(deviation[:, part], fit.covariance[:, part, part], fit.layout.sigma[:, part]),
         )
     return out
+
+
+def _p_nominal(
+    deviation: Float[Tensor, "b k"], covariance: Float[Tensor, "b k k"], prior_sigma: Float[Tensor, "b k"]
+) -> Float[Tensor, " b"]:
+    """P-value of the data alone for unknowns that are exactly nominal (Wald's test, chi^2).
+
+    In units of the prior the estimate has covariance P = (I + D^-1)^-1, D that of the data alone, and is P D^-1 times
+    the data's own estimate. In a direction of eigenvalue p of P an estimate x therefore counts x^2 / (p (1 - p)).
+    Directions that the data hardly see do not count.
+    """
+    scaled = covariance / (prior_sigma[:, :, None] * prior_sigma[:, None])
+    values, vectors = torch.linalg.eigh(torch.nan_to_num(scaled))
+    along = (vectors.mT @ (deviation / prior_sigma)[..., None])[..., 0]
+    seen = (values > 0.0) & (values < SEEN_PART)
+    statistic = torch.where(seen, along.square() / (values * (1.0 - values)).clamp_min(1e-300), 0.0).sum(-1)
+    degrees = seen.sum(-1).to(statistic.dtype)
+    p = torch.special.gammaincc(0.5 * degrees.clamp_min(1.0), 0.5 * statistic)
+    return torch.where(degrees > 0, p, 1.0)
 
 
 def _sight(

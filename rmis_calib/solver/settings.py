@@ -49,8 +49,12 @@ class UnknownSettings:
     """Estimate by how much the shaft's axis misses the nominal RCM, two components across the axis, fixed to `rcm`."""
     rcm_offset_sigma_mm: NotNegative = 2.0
     """Prior of each component."""
-    joint_offsets: bool = False
-    """Estimate constant joint offsets; needs the derivatives of the kinematics in the problem."""
+    joint_offsets: Literal["auto", "always", "never"] = "auto"
+    """Estimate constant joint offsets, where the derivatives of the kinematics are in the problem. `calibrate` does so
+    first with `auto`, and leaves them out again unless the data contradict perfect encoders: a robot without offsets
+    is calibrated three times more exactly without these unknowns."""
+    joint_offset_p_value: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-3
+    """With `auto`: chance at which a robot without offsets is taken for one that has some."""
     joint_offset_sigma_deg: NotNegative = 1.0
     """Prior of the offset of a revolute joint."""
     joint_offset_sigma_mm: NotNegative = 2.0

@@ -73,13 +73,15 @@ _REASONS = {
 @dataclass(frozen=True)
 class Nuisance:
     """An unknown that was estimated beside the transform: value, 1 sigma, unit, whether the data could not tell it
-    (held), and how many sigmas of its prior it was pulled from its nominal value."""
+    (held), how many sigmas of its prior it was pulled from its nominal value, and the p-value of its being nominal in
+    every component, by what the data alone say."""
 
     value: Float[Tensor, "*batch k"]
     sigma: Float[Tensor, "*batch k"]
     unit: str
     held: Bool[Tensor, "*batch k"]
     pull: Float[Tensor, "*batch k"]
+    p_nominal: Float[Tensor, "*batch"]
 
 
 @dataclass(frozen=True)

@@ -163,7 +163,7 @@ def make_layout(
         entries.append(("end_offset", 1, torch.full_like(infinite, settings.end_offset_sigma_mm)))
     if settings.rcm_offset:
         entries.append(("rcm_offset", 2, torch.full_like(infinite, settings.rcm_offset_sigma_mm)))
-    if settings.joint_offsets and packed.joint is not None and nominal.joint_offset_sigma.shape[1] > 0:
+    if settings.joint_offsets != "never" and packed.joint is not None and nominal.joint_offset_sigma.shape[1] > 0:
         entries.append(("joint_offset", packed.joint.shape[1], nominal.joint_offset_sigma))
     if settings.clock and packed.clock is not None:
         entries.append(("clock", 1, torch.full_like(infinite, settings.clock_sigma_s)))

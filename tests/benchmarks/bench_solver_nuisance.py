@@ -199,7 +199,7 @@ def main() -> int:
     t, n = args.trials, args.motions
     print(f"{t} trials of {n} motions, 0.3 px, 0.3 mm, 0.1 deg; contours and ends, stereo\n")
     print(f"{'':34} | ignored: deg, mm (sigma)    | estimated: deg, mm (sigma)  | first trial: value +- sigma")
-    known = UnknownSettings(radius_sigma_relative=0.0, stereo=False)
+    known = UnknownSettings(radius_sigma_relative=0.0, stereo=False, joint_offsets="never")
     zero_j, zero_c = torch.zeros(t, 6, dtype=torch.float64), torch.zeros(t, dtype=torch.float64)
 
     def restricted(recorded):
@@ -215,7 +215,7 @@ def main() -> int:
         kinematics(zero_j, zero_c),
         truth,
         known,
-        replace(known, joint_offsets=True),
+        replace(known, joint_offsets="always"),
         kinematics,
         report="joint_offset",
     )

@@ -97,7 +97,7 @@ def test_clock_offset_is_found_from_most_of_a_second_away(moving):
     poses = motion_poses(recording)
     unknowns = KinematicUnknowns(recording, poses.frames, "cpu")
     observations = observations_from_truth(moving, recording, poses)
-    solution = estimate_with_kinematics(observations, parse_config({}), unknowns)
+    solution, _ = estimate_with_kinematics(observations, parse_config({}), unknowns)
     clock = solution.nuisances["clock"]
     assert float(clock.value) == pytest.approx(CLOCK_S, abs=0.01)
     assert not bool(clock.held)
@@ -108,8 +108,8 @@ def test_joint_offsets_are_found_within_their_sigmas_or_held(moving):
     poses = motion_poses(recording)
     unknowns = KinematicUnknowns(recording, poses.frames, "cpu")
     observations = observations_from_truth(moving, recording, poses)
-    config = parse_config({"solver": {"unknowns": {"joint_offsets": True, "clock": False}}})
-    solution = estimate_with_kinematics(observations, config, unknowns)
+    config = parse_config({"solver": {"unknowns": {"joint_offsets": "always", "clock": False}}})
+    solution, _ = estimate_with_kinematics(observations, config, unknowns)
     offsets = solution.nuisances["joint_offset"]
     truth = yaml.safe_load((moving / "ground_truth.yaml").read_text())["joint_offsets"]
     expected = torch.tensor([truth[column] for column in unknowns.columns], dtype=torch.float64)

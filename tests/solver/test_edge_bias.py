@@ -41,11 +41,11 @@ def test_shift_shared_by_all_pictures_is_estimated(simulate, realistic):
     clean = Problem.from_arrays(arrays).only("contours")
     shared = Problem.from_arrays(shifted(arrays) | {"sigma_edge_bias": 2.0 / FOCAL_PX}).only("contours")
     without, _ = rms_deg(clean, KNOWN)
-    ignored, _ = rms_deg(shared, replace(KNOWN, edge_bias=False))
+    ignored, claimed = rms_deg(shared, replace(KNOWN, edge_bias=False))
     estimated, sigma = rms_deg(shared, KNOWN)
-    assert ignored > 2.5 * without
-    assert estimated < 2.0 * without
-    assert estimated < 1.5 * sigma  # and its covariance knows the price
+    assert ignored > 4.0 * without and ignored > 4.0 * claimed
+    assert estimated < 0.6 * ignored
+    assert estimated < 1.5 * sigma  # the covariance knows the price
 
 
 def test_estimated_shift_is_the_true_one(simulate):

@@ -14,7 +14,7 @@ from rmis_calib.solver.relinearise import scan_clock
 from rmis_calib.solver.settings import UnknownSettings
 from tests.benchmarks.bench_solver_nuisance import record
 
-KNOWN = UnknownSettings(radius_sigma_relative=0.0, stereo=False)
+KNOWN = UnknownSettings(radius_sigma_relative=0.0, stereo=False, joint_offsets="never")
 ZERO = torch.zeros(1, 6, dtype=torch.float64)
 STILL = torch.zeros(1, dtype=torch.float64)
 
@@ -46,7 +46,7 @@ def test_joint_offsets_are_estimated_or_held():
     kinematics = kinematics_of(recorded)
     start = kinematics(ZERO, STILL)
     ignored = solve(start, SolverSettings(unknowns=KNOWN))
-    solution = solve(start, SolverSettings(unknowns=replace(KNOWN, joint_offsets=True)), kinematics=kinematics)
+    solution = solve(start, SolverSettings(unknowns=replace(KNOWN, joint_offsets="always")), kinematics=kinematics)
     estimate = solution.nuisances["joint_offset"]
     assert bool(((estimate.value[0] - offset).abs() < 4.0 * estimate.sigma[0]).all())
     seen = ~estimate.held[0]

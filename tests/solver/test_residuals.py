@@ -14,7 +14,7 @@ from rmis_calib.solver.residuals import linearise, residual_rows
 from rmis_calib.solver.settings import UnknownSettings
 from rmis_calib.solver.unknowns import Nominal, columns, initial_state, make_layout
 
-EVERYTHING = UnknownSettings(rcm_offset=True, joint_offsets=True, clock=True)
+EVERYTHING = UnknownSettings(rcm_offset=True, joint_offsets="always", clock=True)
 
 
 @pytest.fixture(scope="module")
