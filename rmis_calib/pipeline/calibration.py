@@ -132,13 +132,22 @@ def run_calibration(
     poses = motion_poses(recording, config.device)
     views = detect_recording(recording, config, progress, segment=segment)
     choices = tuple(first_choice(select_frames(view.detections, poses.frames)) for view in views)
-    run = _solve_choice(recording, config, views, poses, choices, progress)
+    draft = _without_joint_offsets(config)
+    run = _solve_choice(recording, draft, views, poses, choices, progress)
     for _ in range(CHOICE_ROUNDS - 1):
         better = _choose_again(run)
         if better is None or all(new.same_as(old) for new, old in zip(better, run.choices, strict=True)):
             break
-        run = _solve_choice(recording, config, views, poses, better, progress)
-    return run
+        run = _solve_choice(recording, draft, views, poses, better, progress)
+    return run if draft == config else _solve_choice(recording, config, views, poses, run.choices, progress)
+
+
+def _without_joint_offsets(config: CalibrationConfig) -> CalibrationConfig:
+    """A shaft is told from another one well enough without asking whether the encoders have offsets."""
+    unknowns = config.solver.unknowns
+    if unknowns.joint_offsets != "auto":
+        return config
+    return replace(config, solver=replace(config.solver, unknowns=replace(unknowns, joint_offsets="never")))
 
 
 def _solve_choice(

@@ -15,7 +15,7 @@ from rmis_calib.results import STATUS_SENTENCES, CalibrationResult, Motions, Sta
 from rmis_calib.solver import Problem, Solution, SolveStatus
 from rmis_calib.solver import solve as solve_problem
 from rmis_calib.solver.relinearise import scan_clock
-from rmis_calib.solver.solution import MotionReason, Nuisance, Observability
+from rmis_calib.solver.solution import MotionReason, Nuisance, Observability, Rival
 
 COARSE_CLOCK_STEP_S, CLOCK_STEP_S = 0.1, 0.02
 """Spacing of the clock offsets that are tried, first everywhere, then near the best: motion hardly turns within
@@ -63,9 +63,9 @@ def estimate_with_kinematics(
     """The same with constant joint offsets, and the clock offset, among the unknowns of `joint`; and what was decided
     about the offsets, in sentences.
 
-    With `auto` the offsets are left out in a second solve unless the data contradict a robot without any. An offset
-    that the data cannot tell from the transform (its sigma stays at its prior) is held at zero: its prior would else be
-    counted as uncertainty of a transform that absorbs it anyway.
+    An offset that the data cannot tell from the transform (its sigma stays at its prior) is held at zero: its prior
+    would else be counted as uncertainty of a transform that absorbs it anyway. With `auto` all offsets are left out
+    when a robot without any explains the data better; the covariance then allows for the other possibility.
     """
     base = _problem(observations, config).flatten_batch()
     asked = config.solver.unknowns
@@ -76,59 +76,47 @@ def estimate_with_kinematics(
     if asked.clock and unknowns.has_clock:
         clock_s = clock_s + _clock_start(base, unknowns, config.clock_search_s, sigma)
 
-    def solve_with(sigma: torch.Tensor) -> Solution:
+    def solve_with(sigma: torch.Tensor, rival: Rival | None = None) -> Solution:
         def kinematics(joint_offset: torch.Tensor, clock_s: torch.Tensor) -> Problem:
             return unknowns.linearised(base, joint_offset, clock_s, sigma)
 
         start = kinematics(torch.zeros_like(sigma)[None], clock_s)
-        return solve_problem(start.take_trials(0), config.solver, kinematics=kinematics)
+        return solve_problem(start.take_trials(0), config.solver, kinematics=kinematics, rival=rival)
 
     solution = solve_with(sigma)
-    offsets = solution.nuisances.get("joint_offset")
-    if offsets is None:
+    if "joint_offset" not in solution.nuisances:
         return solution, ()
-    p = float(offsets.p_nominal)
-    if asked.joint_offsets == "auto" and not p < asked.joint_offset_p_value:
-        return solve_with(sigma * 0.0), (_without_offsets(offsets, unknowns.columns, p),)
-    if bool(offsets.held.any()):
-        solution = solve_with(torch.where(offsets.held, HELD * sigma, sigma))
-    return solution, (_with_offsets(offsets, unknowns.columns, p),)
+    held = solution.nuisances["joint_offset"].held
+    if bool(held.any()):
+        solution = solve_with(torch.where(held, HELD * sigma, sigma))
+    offsets = solution.nuisances["joint_offset"]
+    belief = offsets.log_odds_nominal.new_tensor(asked.joint_offset_belief)
+    probability = torch.sigmoid(torch.logit(belief) - offsets.log_odds_nominal)
+    note = _about_offsets(offsets, held, unknowns.columns, float(probability))
+    if asked.joint_offsets == "always" or bool(offsets.log_odds_nominal < 0.0):
+        return solution, (note,)
+    return solve_with(sigma * 0.0, Rival(solution.camera_right_T_arm, solution.covariance, probability)), (note,)
 
 
-def _without_offsets(offsets: Nuisance, columns: tuple[str, ...], p: float) -> str:
-    """Why joint offsets were left out, and up to what size they would not show."""
-    seen = [
-        f"{column.rpartition('_')[0]} {3.0 * _shown(sigma, column):.2g} {_shown_unit(column)}"
-        for column, sigma, held in zip(columns, offsets.sigma.tolist(), offsets.held.tolist(), strict=True)
-        if not held
-    ]
-    if not seen:
-        return "Constant joint offsets cannot be told from the transform here, and are part of it."
+def _about_offsets(offsets: Nuisance, held: torch.Tensor, columns: tuple[str, ...], probability: float) -> str:
+    """Whether the encoders have offsets, what would not show, and what is part of the transform."""
+    names = [column.rpartition("_")[0] for column in columns]
+    hidden = ", ".join(name for name, is_held in zip(names, held.tolist(), strict=True) if is_held)
+    if bool(held.all()):
+        return f"Constant joint offsets cannot be told from the transform here, and are part of it ({hidden})."
+    seen = ", ".join(
+        f"{name} {_shown(sigma, column)}"
+        for name, column, sigma, is_held in zip(names, columns, offsets.sigma.tolist(), held.tolist(), strict=True)
+        if not is_held
+    )
     return (
-        f"The data do not ask for constant joint offsets (p = {p:.2g}); up to 3 sigma they would not show: "
-        + ", ".join(seen)
+        f"Constant joint offsets are {100.0 * probability:.0f} % probable; the data see them to 1 sigma of {seen}"
+        + (f"; those of {hidden} cannot be told from the transform and are part of it." if hidden else ".")
     )
 
 
-def _with_offsets(offsets: Nuisance, columns: tuple[str, ...], p: float) -> str:
-    """That joint offsets were estimated, and which are part of the transform instead."""
-    held = [
-        column.rpartition("_")[0] for column, is_held in zip(columns, offsets.held.tolist(), strict=True) if is_held
-    ]
-    sentence = f"The encoders have constant offsets (p = {p:.1g} for none): they are estimated"
-    return (
-        f"{sentence}; those of {', '.join(held)} cannot be told from the transform and are part of it"
-        if held
-        else sentence
-    )
-
-
-def _shown(value: float, column: str) -> float:
-    return float(np.rad2deg(value)) if column.endswith("_rad") else value
-
-
-def _shown_unit(column: str) -> str:
-    return "deg" if column.endswith("_rad") else "mm"
+def _shown(sigma: float, column: str) -> str:
+    return f"{np.rad2deg(sigma):.2g} deg" if column.endswith("_rad") else f"{sigma:.2g} mm"
 
 
 def _clock_start(base: Problem, unknowns: KinematicUnknowns, reach_s: float, like: torch.Tensor) -> float:

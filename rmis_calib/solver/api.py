@@ -17,7 +17,7 @@ from rmis_calib.solver.paper import average, empirical_covariance, influence, so
 from rmis_calib.solver.problem import MIN_MOTIONS, Problem
 from rmis_calib.solver.relinearise import Kinematics, solve_relinearised
 from rmis_calib.solver.settings import SolverSettings
-from rmis_calib.solver.solution import MotionReason, Nuisance, Solution
+from rmis_calib.solver.solution import MotionReason, Nuisance, Rival, Solution
 from rmis_calib.solver.statistics import LineStatistics
 
 
@@ -26,6 +26,7 @@ def solve(
     settings: SolverSettings | None = None,
     method: str | None = None,
     kinematics: Kinematics | None = None,
+    rival: Rival | None = None,
 ) -> Solution:
     """Estimates `camera_right_T_arm` of every trial.
 
@@ -34,6 +35,7 @@ def solve(
         settings: defaults when absent.
         method: overrides the settings' method.
         kinematics: evaluates both arms at joint and clock offsets (relinearise.py); with it, `joint` iterates on them.
+        rival: the answer of another model, which the covariance of `joint` then allows for.
 
     Raises:
         ObservationsError: values that are not finite where they must be, or rotations that are not rotations.
@@ -49,7 +51,7 @@ def solve(
             index, kept = _informative(flat, settings, settings.thin_to)
             flat = flat.select_motions(index)
         fit = solve_joint(flat, settings) if kinematics is None else solve_relinearised(flat, settings, kinematics)
-        solution = joint_solution(fit, settings)
+        solution = joint_solution(fit, settings, rival)
         if index is not None:
             solution = replace(_spread(solution, index, problem.n_motions), information_kept=kept)
         return _shaped(solution, problem.batch_shape)

@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from rmis_calib.geometry.rigid import rigid_from_rotation_translation
+from rmis_calib.geometry.rotations import matrix_to_rotvec
 from rmis_calib.solver.competition import cheirality
 from rmis_calib.solver.initialise import COLLAPSED_MM, collapsed
 from rmis_calib.solver.joint import JointFit
@@ -17,14 +18,12 @@ from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.residuals import State, residual_rows
 from rmis_calib.solver.robust import REJECTED
 from rmis_calib.solver.settings import SolverSettings, UnknownSettings
-from rmis_calib.solver.solution import MotionReason, Nuisance, Sight, Solution, SolveStatus
+from rmis_calib.solver.solution import MotionReason, Nuisance, Rival, Sight, Solution, SolveStatus
 from rmis_calib.solver.unknowns import TRANSLATION_SIGMA_MM, UNITS, Nominal, initial_state, make_layout
 from rmis_calib.solver.variance import COMPONENTS, assumed_noise
 
 MIN_CHEIRALITY = 0.5
 CHECKED_MOTIONS = 256
-SEEN_PART = 0.5
-"""Part of the prior's variance below which the data must bring a direction to count as seen by them."""
 MAX_CHI2_PER_DOF = 3.0
 """Past this the model is wrong (swapped cameras, another rig), and no larger noise level makes it right."""
 SHOWN_MOTIONS = 4096
@@ -98,12 +97,14 @@ def _unseen_depth(flat: Problem, R: Tensor, t: Tensor) -> Float[Tensor, "b 6 6"]
     return torch.nn.functional.pad(torch.where(unseen[:, None, None], block, 0.0), (3, 0, 3, 0))
 
 
-def joint_solution(fit: JointFit, settings: SolverSettings) -> Solution:
-    """Solution of the joint estimate."""
+def joint_solution(fit: JointFit, settings: SolverSettings, rival: Rival | None = None) -> Solution:
+    """Solution of the joint estimate; its covariance admits that the rival may be right."""
     packed, state = fit.packed, fit.state
     C = fit.covariance[:, :6, :6]
     status, reason, excess = _judge(fit)
     C = C * excess.clamp_min(1.0)[:, None, None]  # too small noise levels would make sigma too small (Birge 1932)
+    if rival is not None:
+        C = _mixed(C, state.R, state.t, rival)
     distance = (fit.distance2 / packed.rows_ok.sum(0).clamp_min(1)).sqrt()
     uses = (packed.has_contours, packed.has_ends, packed.has_heads)
     left = rigid_from_rotation_translation(state.stereo_R, state.stereo_t) if packed.cameras == 2 else None
@@ -128,6 +129,17 @@ def joint_solution(fit: JointFit, settings: SolverSettings) -> Solution:
         residual_ends=shown.ends,
         residual_heads=shown.heads,
     )
+
+
+def _mixed(
+    C: Float[Tensor, "b 6 6"], R: Float[Tensor, "b 3 3"], t: Float[Tensor, "b 3"], rival: Rival
+) -> Float[Tensor, "b 6 6"]:
+    """Covariance about this estimate when the rival's model is right with its probability (Bayesian model averaging:
+    Hoeting et al. 1999)."""
+    T = rival.camera_right_T_arm.reshape(-1, 4, 4)
+    gap = torch.cat((matrix_to_rotvec(T[:, :3, :3] @ R.mT), T[:, :3, 3] - t), dim=-1)
+    weight = rival.probability.reshape(-1, 1, 1)
+    return (1.0 - weight) * C + weight * (rival.covariance.reshape(-1, 6, 6) + gap[:, :, None] * gap[:, None])
 
 
 def _judge(fit: JointFit) -> tuple[Int[Tensor, " b"], Int[Tensor, "b n"], Float[Tensor, " b"]]:
@@ -168,28 +180,27 @@ def _nuisances(fit: JointFit, settings: SolverSettings) -> dict[str, Nuisance]:
             unit=UNITS[name],
             held=held,
             pull=deviation[:, part] / fit.layout.sigma[:, part],
-            p_nominal=_p_nominal(deviation[:, part], fit.covariance[:, part, part], fit.layout.sigma[:, part]),
+            log_odds_nominal=_log_odds_nominal(
+                deviation[:, part], fit.covariance[:, part, part], fit.layout.sigma[:, part]
+            ),
         )
     return out
 
 
-def _p_nominal(
+def _log_odds_nominal(
     deviation: Float[Tensor, "b k"], covariance: Float[Tensor, "b k k"], prior_sigma: Float[Tensor, "b k"]
 ) -> Float[Tensor, " b"]:
-    """P-value of the data alone for unknowns that are exactly nominal (Wald's test, chi^2).
+    """Log of the Bayes factor for "exactly nominal" against "anywhere within the prior".
 
-    In units of the prior the estimate has covariance P = (I + D^-1)^-1, D that of the data alone, and is P D^-1 times
-    the data's own estimate. In a direction of eigenvalue p of P an estimate x therefore counts x^2 / (p (1 - p)).
-    Directions that the data hardly see do not count.
+    It is the posterior's density at the nominal values over the prior's (Dickey & Lientz 1970). In units of the prior,
+    a direction of posterior variance p in which the estimate is at x adds -(log p + x^2 / p) / 2: one that the data do
+    not see adds nothing, one that they see and find nominal speaks for "nominal".
     """
     scaled = covariance / (prior_sigma[:, :, None] * prior_sigma[:, None])
     values, vectors = torch.linalg.eigh(torch.nan_to_num(scaled))
     along = (vectors.mT @ (deviation / prior_sigma)[..., None])[..., 0]
-    seen = (values > 0.0) & (values < SEEN_PART)
-    statistic = torch.where(seen, along.square() / (values * (1.0 - values)).clamp_min(1e-300), 0.0).sum(-1)
-    degrees = seen.sum(-1).to(statistic.dtype)
-    p = torch.special.gammaincc(0.5 * degrees.clamp_min(1.0), 0.5 * statistic)
-    return torch.where(degrees > 0, p, 1.0)
+    p = values.clamp(1e-12, 1.0)
+    return -0.5 * (p.log() + along.square() / p).sum(-1)
 
 
 def _sight(

@@ -51,13 +51,14 @@ class UnknownSettings:
     """Prior of each component."""
     joint_offsets: Literal["auto", "always", "never"] = "auto"
     """Estimate constant joint offsets, where the derivatives of the kinematics are in the problem. `calibrate` does so
-    first with `auto`, and leaves them out again unless the data contradict perfect encoders: a robot without offsets
-    is calibrated three times more exactly without these unknowns."""
-    joint_offset_p_value: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-3
-    """With `auto`: chance at which a robot without offsets is taken for one that has some."""
-    joint_offset_sigma_deg: NotNegative = 1.0
+    first with `auto`, and leaves them out again where perfect encoders are the more probable explanation: a robot
+    without offsets is calibrated three times more exactly without these unknowns."""
+    joint_offset_belief: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.8
+    """With `auto`: probability, before the data speak, that the encoders have offsets of about their prior. It decides
+    how much the covariance allows for offsets that were left out, not the estimate; 0 trusts the encoders."""
+    joint_offset_sigma_deg: NotNegative = 0.5
     """Prior of the offset of a revolute joint."""
-    joint_offset_sigma_mm: NotNegative = 2.0
+    joint_offset_sigma_mm: NotNegative = 1.0
     """Prior of the offset of a prismatic joint."""
     clock: bool = True
     """Estimate the clock offset between video and joints, where the velocities are in the problem (a continuous

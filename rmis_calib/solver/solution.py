@@ -73,15 +73,24 @@ _REASONS = {
 @dataclass(frozen=True)
 class Nuisance:
     """An unknown that was estimated beside the transform: value, 1 sigma, unit, whether the data could not tell it
-    (held), how many sigmas of its prior it was pulled from its nominal value, and the p-value of its being nominal in
-    every component, by what the data alone say."""
+    (held), how many sigmas of its prior it was pulled from its nominal value, and the log of the odds, in the light of
+    the data, that all of it is exactly nominal."""
 
     value: Float[Tensor, "*batch k"]
     sigma: Float[Tensor, "*batch k"]
     unit: str
     held: Bool[Tensor, "*batch k"]
     pull: Float[Tensor, "*batch k"]
-    p_nominal: Float[Tensor, "*batch"]
+    log_odds_nominal: Float[Tensor, "*batch"]
+
+
+@dataclass(frozen=True)
+class Rival:
+    """The answer of another model of the same data, and the probability that it is that model which is right."""
+
+    camera_right_T_arm: Float[Tensor, "*batch 4 4"]
+    covariance: Float[Tensor, "*batch 6 6"]
+    probability: Float[Tensor, "*batch"]
 
 
 @dataclass(frozen=True)
