@@ -6,7 +6,16 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rmis_calib.vision.runs import bridge, first_on, last_on, masked_mean, masked_median, run_any, run_lengths
+from rmis_calib.vision.runs import (
+    bridge,
+    first_on,
+    last_on,
+    masked_mean,
+    masked_median,
+    run_any,
+    run_lengths,
+    third_lowest,
+)
 from rmis_calib.vision.settings import DetectorSettings
 from rmis_calib.vision.strips import SmallPicture, Strips
 
@@ -64,50 +73,50 @@ class _Profiles:
 def _profiles(picture: SmallPicture, strips: Strips, t: Float[Tensor, " s"], narrowest_px: float) -> _Profiles:
     """Read inside, just across both contours, and beyond them, at every station."""
     stations = t.expand(*strips.valid.shape, t.shape[0])
-    edge = strips.contour(stations)
-    left, right = edge.unbind(2)
+    left, right = strips.contour(stations).unbind(2)
     width = left - right
     unit = float(picture.factor)
     half = (0.5 * width - 1.5 * unit).clamp(min=0.25 * unit)
-    inner_y = 0.5 * (left + right)[..., None] + half[..., None] * torch.linspace(-1, 1, _INNER, device=t.device)
+    share = torch.linspace(-1, 1, _INNER, device=t.device)[:, None]
+    inner_y = 0.5 * (left + right)[:, :, None] + half[:, :, None] * share
     # Defocus and motion blur make the contours of a wide shaft several small pixels soft.
     near = (0.07 * width).clamp(min=1.5 * unit)
-    rim_y = torch.stack([left + near, left - near, right + near, right - near], -1)
-    far = torch.stack([(0.2 * width).clamp(min=3 * unit), (0.4 * width).clamp(min=5 * unit)], -1)
-    beyond_y = torch.cat([left[..., None] + far, right[..., None] - far], -1)
-    lateral = torch.cat([inner_y, rim_y, beyond_y], -1)
-    value, seen, tone = picture.read(strips, stations[..., None], lateral)
-    rim, beyond = value[..., _INNER : _INNER + _RIM], value[..., _INNER + _RIM :]
+    far = [(0.2 * width).clamp(min=3 * unit), (0.4 * width).clamp(min=5 * unit)]
+    around = [left + near, left - near, right + near, right - near, *(left + f for f in far), *(right - f for f in far)]
+    lateral = torch.cat([inner_y, torch.stack(around, 2)], 2)  # (b, k, n, s)
+    value, seen, tone = picture.read(strips, stations[:, :, None], lateral)
+    left_outside, left_inside, right_inside, right_outside = value[:, :, _INNER : _INNER + _RIM].unbind(2)
     # The third darkest of seven: a glare stripe may cover half of the width.
-    inner = value[..., :_INNER].kthvalue(3, -1).values
+    inner = third_lowest(value[:, :, :_INNER])
     inf = value.new_tensor(torch.inf)
-    rim_seen = seen[..., _INNER : _INNER + _RIM]
-    left_seen, right_seen = rim_seen[..., :2].all(-1), rim_seen[..., 2:].all(-1)
+    left_seen, right_seen = (seen[:, :, at] & seen[:, :, at + 1] for at in (_INNER, _INNER + 2))
     step = torch.minimum(
-        torch.where(left_seen, rim[..., 0] - rim[..., 1], inf), torch.where(right_seen, rim[..., 3] - rim[..., 2], inf)
+        torch.where(left_seen, left_outside - left_inside, inf),
+        torch.where(right_seen, right_outside - right_inside, inf),
     )
-    outer = torch.minimum(torch.where(left_seen, rim[..., 0], inf), torch.where(right_seen, rim[..., 3], inf))
+    outer = torch.minimum(torch.where(left_seen, left_outside, inf), torch.where(right_seen, right_outside, inf))
     one_side, both_sides = left_seen | right_seen, left_seen & right_seen
-    middle = 0.5 * (inner + outer)[..., None]
+    middle = 0.5 * (inner + outer)
     glare = _glare(value, tone)
     # Beyond a contour there is neither more shaft nor the glare on it: else the strip is a part of a wider one.
-    brighter_side = torch.maximum(rim[..., 0], rim[..., 3])[..., None]
-    open_beyond = torch.maximum(middle, inner[..., None] + 0.35 * (brighter_side - inner[..., None]))
-    free = ((beyond > open_beyond) & ~glare[..., _INNER + _RIM :]) | ~seen[..., _INNER + _RIM :]
-    own = (value[..., :_INNER] < middle) | glare[..., :_INNER]
-    purity = own.float().mean(-1) * free.float().mean(-1)
-    centre_seen = seen[..., _INNER // 2]
-    brighter = tone[..., :_INNER].kthvalue(3, -1).values - 0.5 * (tone[..., _INNER] + tone[..., _INNER + 3])
+    brighter_side = torch.maximum(left_outside, right_outside)
+    open_beyond = torch.maximum(middle, inner + 0.35 * (brighter_side - inner))[:, :, None]
+    beyond = slice(_INNER + _RIM, None)
+    free = ((value[:, :, beyond] > open_beyond) & ~glare[:, :, beyond]) | ~seen[:, :, beyond]
+    own = (value[:, :, :_INNER] < middle[:, :, None]) | glare[:, :, :_INNER]
+    purity = own.float().mean(2) * free.float().mean(2)
+    centre_seen = seen[:, :, _INNER // 2]
+    brighter = third_lowest(tone[:, :, :_INNER]) - 0.5 * (tone[:, :, _INNER] + tone[:, :, _INNER + 3])
     is_open = centre_seen & one_side & (width > narrowest_px) & strips.valid[..., None] & (brighter < MAX_BRIGHTER)
     return _Profiles(inner, outer, step, purity, is_open, both_sides, centre_seen, width)
 
 
-def _glare(value: Float[Tensor, "b k s n"], tone: Float[Tensor, "b k s n"]) -> Bool[Tensor, "b k s n"]:
+def _glare(value: Float[Tensor, "b k n s"], tone: Float[Tensor, "b k n s"]) -> Bool[Tensor, "b k n s"]:
     """Points brighter than the surroundings of the strip that have lost their tint: light reflected by a shaft."""
     tint = value - tone
-    sides = [_INNER, _INNER + 3]
-    tinted = tint[..., sides].amax(-1, keepdim=True)
-    bright = tone[..., sides].amin(-1, keepdim=True)
+    left, right = _INNER, _INNER + 3
+    tinted = torch.maximum(tint[:, :, left], tint[:, :, right])[:, :, None]
+    bright = torch.minimum(tone[:, :, left], tone[:, :, right])[:, :, None]
     return (tint < 0.4 * tinted) & (tone > bright + 0.1) & (tinted > 0.15)
 
 
@@ -122,13 +131,13 @@ def screen(picture: SmallPicture, strips: Strips, settings: DetectorSettings, co
     width = left - right
     near = (0.1 * width).clamp(min=2.0 * picture.factor)
     middle = 0.5 * (left + right)
-    lateral = torch.stack([left + near, middle + 0.25 * width, middle, middle - 0.25 * width, right - near], -1)
-    value, seen, _ = picture.read(strips, stations[..., None], lateral)
-    inner = value[..., 1:4].amin(-1)
-    left_rise = torch.where(seen[..., 0], value[..., 0] - inner, torch.inf)
-    right_rise = torch.where(seen[..., 4], value[..., 4] - inner, torch.inf)
+    lateral = torch.stack([left + near, middle + 0.25 * width, middle, middle - 0.25 * width, right - near], 2)
+    value, seen, _ = picture.read(strips, stations[:, :, None], lateral)
+    inner = value[:, :, 1:4].amin(2)
+    left_rise = torch.where(seen[:, :, 0], value[:, :, 0] - inner, torch.inf)
+    right_rise = torch.where(seen[:, :, 4], value[:, :, 4] - inner, torch.inf)
     rise = torch.minimum(left_rise, right_rise)
-    good = seen[..., 2] & torch.isfinite(rise) & (width > 0)
+    good = seen[:, :, 2] & torch.isfinite(rise) & (width > 0)
     look = torch.where(good & (rise > 0.8 * settings.min_contrast), 1.0 + 0.5 * rise.clamp(0.0, 1.0), 0.0).sum(-1)
     best = torch.where(strips.valid, look, -1.0).topk(min(count, look.shape[1]), dim=1)
     return strips.pick(best.indices)

@@ -23,6 +23,7 @@ from rmis_calib.vision.runs import (
     run_minimum,
     run_range,
     smooth_over,
+    third_lowest,
 )
 from rmis_calib.vision.scoring import MAX_BRIGHTER
 from rmis_calib.vision.settings import DetectorSettings
@@ -85,18 +86,18 @@ def _follow(picture: SmallPicture, strips: Strips, stations: Float[Tensor, "b k 
     predicted = strips.contour(stations)  # (b, k, 2, s)
     width = (predicted[:, :, :1] - predicted[:, :, 1:]).clamp(min=1.0)
     unit = float(picture.factor)
-    near = (0.07 * width).clamp(min=1.5 * unit)[..., None]
-    reach = (0.2 * width).clamp(min=2.0 * unit)[..., None]
-    share = torch.linspace(-1, 1, _OFFSETS, device=stations.device)
-    lateral = predicted[..., None] + reach * share  # (b, k, 2, s, o)
-    outward = stations.new_tensor([1.0, -1.0])[:, None, None]
-    both = torch.stack([lateral + near * outward, lateral - near * outward], -1)
-    value, seen, tone = picture.read(strips, stations[:, :, None, :, None, None], both)
-    rise = (value[..., 0] - value[..., 1]) * seen.all(-1)
-    best = (rise * torch.exp(-0.5 * (1.2 * share) ** 2)).argmax(-1, keepdim=True)
-    place, step, outer = (v.gather(-1, best)[..., 0] for v in (lateral, rise, value[..., 0]))
-    beside = tone[..., 0].gather(-1, best)[..., 0]
-    return _Sides(place, step, outer, beside, seen[..., _OFFSETS // 2, :].all(-1))
+    near = (0.07 * width).clamp(min=1.5 * unit) * stations.new_tensor([1.0, -1.0])[:, None]  # outwards
+    reach = (0.2 * width).clamp(min=2.0 * unit)
+    share = torch.linspace(-1, 1, _OFFSETS, device=stations.device)[:, None, None]
+    lateral = predicted[:, :, None] + reach[:, :, None] * share  # (b, k, o, 2, s)
+    both = torch.stack([lateral + near[:, :, None], lateral - near[:, :, None]], 2)
+    value, seen, tone = picture.read(strips, stations[:, :, None, None, None], both)
+    seen = seen[:, :, 0] & seen[:, :, 1]
+    rise = (value[:, :, 0] - value[:, :, 1]) * seen
+    best = (rise * torch.exp(-0.5 * (1.2 * share) ** 2)).argmax(2, keepdim=True)
+    layers = (lateral, rise, value[:, :, 0], tone[:, :, 0])
+    place, step, outer, beside = (layer.gather(2, best)[:, :, 0] for layer in layers)
+    return _Sides(place, step, outer, beside, seen[:, :, _OFFSETS // 2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,13 +111,13 @@ class _Middle:
 def _read_middle(picture: SmallPicture, strips: Strips, stations: Float[Tensor, "b k s"], sides: _Sides) -> _Middle:
     """Tone of the inside, and of both sides most of a width away from the middle line."""
     left, right = sides.lateral.unbind(2)
-    across = left.new_tensor([-0.35, -0.233, -0.117, 0.0, 0.117, 0.233, 0.35, -0.85, 0.85])
-    y = 0.5 * (left + right)[..., None] + (left - right)[..., None] * across
-    value, seen, tone = picture.read(strips, stations[..., None], y)
+    across = left.new_tensor([-0.35, -0.233, -0.117, 0.0, 0.117, 0.233, 0.35, -0.85, 0.85])[:, None]
+    y = 0.5 * (left + right)[:, :, None] + (left - right)[:, :, None] * across
+    value, seen, tone = picture.read(strips, stations[:, :, None], y)
     # The third darkest of seven: a glare stripe may cover half of the width and more.
-    inner, brightness = (layer[..., :7].kthvalue(3, -1).values for layer in (value, tone))
-    far = torch.where(seen[..., 7:], value[..., 7:], torch.inf).amin(-1)
-    return _Middle(inner, far, brightness, seen[..., 3])
+    inner, brightness = (third_lowest(layer[:, :, :7]) for layer in (value, tone))
+    far = torch.where(seen[:, :, 7:], value[:, :, 7:], torch.inf).amin(2)
+    return _Middle(inner, far, brightness, seen[:, :, 3])
 
 
 def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> Trace:
