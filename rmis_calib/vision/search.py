@@ -61,11 +61,7 @@ def search(
     """
     small = shrink(images, canvas.factor)
     field, within = shaft_mask.field_of_view(small, settings.black_level, _RIM_PX)
-    stack = torch.cat([small, field[:, None].to(small.dtype), within[:, None].to(small.dtype)], 1)
-    stack = canvas.lay_out(stack)
-    rgb, seen, well_inside = stack[:, :3], stack[:, 3] > 0.5, stack[:, 4] > 0.99
-    if canvas.covered is not None:
-        seen, well_inside = seen & canvas.covered, well_inside & canvas.covered
+    rgb, seen, well_inside = _lay_out(canvas, small, field, within)
     if masks is None:
         unlike, tone = shaft_mask.unlikeness(rgb, seen)
     else:
@@ -90,6 +86,16 @@ def search(
     return Found(traced, keep, best), Stages(
         rgb, seen, unlike, ridge, votes, lines, evidence, scores, canvas.factor, canvas.origin
     )
+
+
+def _lay_out(
+    canvas: Canvas, small: Float[Tensor, "b 3 h w"], field: Bool[Tensor, "b h w"], within: Bool[Tensor, "b h w"]
+) -> tuple[Float[Tensor, "b 3 h2 w2"], Bool[Tensor, "b h2 w2"], Bool[Tensor, "b h2 w2"]]:
+    """The shrunken picture, its field of view and the inner part of that, in ideal pixels."""
+    if canvas.grid is None:
+        return small, field, within
+    stack = canvas.lay_out(torch.cat([small, field[:, None].to(small.dtype), within[:, None].to(small.dtype)], 1))
+    return stack[:, :3], (stack[:, 3] > 0.5) & canvas.covered, (stack[:, 4] > 0.99) & canvas.covered
 
 
 def _edges(

@@ -104,18 +104,21 @@ class ShaftDetector:
     def explain(self, images: Tensor, masks: Tensor | None = None) -> tuple[ShaftDetections, Stages]:
         """Shafts, and what each stage of the coarse search saw. Arguments and errors as in `detect`."""
         self._check(images)
-        with torch.no_grad():
+        if masks is None and self.segment is not None:
+            with torch.no_grad():
+                scale = 1.0 / 255.0 if images.dtype == torch.uint8 else 1.0
+                masks = self.segment(torch.nan_to_num(images.to(torch.float32) * scale))
+        with torch.inference_mode():
             broken = torch.zeros(images.shape[0], dtype=torch.bool, device=images.device)
             if images.dtype != torch.uint8:
                 broken = ~torch.isfinite(images).flatten(1).all(1)
                 images = torch.nan_to_num(images.to(torch.float32), nan=0.0, posinf=0.0, neginf=0.0)
-            if masks is None and self.segment is not None:
-                scale = 1.0 / 255.0 if images.dtype == torch.uint8 else 1.0
-                masks = self.segment(images.to(torch.float32) * scale)
             if masks is not None:
                 masks = checked_masks(masks, images)
             found, stages = search(images, self._canvas(images), self.settings, self.settings.max_shafts, masks)
-            return self._measure(images, found, stages, broken), stages
+            measured = self._measure(images, found, stages, broken)
+        # Copied out of inference mode, whose tensors no gradient may be taken with respect to.
+        return ShaftDetections(**{name: value.clone() for name, value in vars(measured).items()}), stages
 
     def _canvas(self, images: Tensor) -> Canvas:
         """The small picture's place, planned once for each size and device."""
