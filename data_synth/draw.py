@@ -2,14 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from data_synth.instruments import Hit, Pixels, dot3, edge, hit_capsule, hit_cylinder, make_cylinders, unit3
+from data_synth.instruments import (
+    Cylinders,
+    Hit,
+    Pixels,
+    dot3,
+    edge,
+    hit_capsule,
+    hit_cylinder,
+    make_cylinders,
+    smeared,
+    unit3,
+)
 from data_synth.materials import Finish, Surface, light_cylinder
 
+GATHER_PX = 4
+"""Pixels of a row that are taken or left together."""
 MARGIN_PX = 4.0
 """Pixels are drawn this many blurs (and at least pixels) outside the outline."""
 JAW_LENGTH_MM = 9.0
@@ -26,11 +39,24 @@ PENUMBRA_MM = 1.6
 
 @dataclass(frozen=True)
 class RayMap:
-    """What every pixel of a camera sees: rays (H, W, 2), their Jacobian (H * W, 4), and the mean focal length, px."""
+    """What every pixel of a camera sees: rays (H, W, 2), their Jacobian (H * W, 4), and the mean focal length, px.
+
+    `read_at` (H,) says when a row is read, 0 to 1 from the first to the last row of the whole picture; `longest_step`
+    is the largest distance between rays of neighbours in a row.
+    """
 
     xy: Tensor
     jacobian: Tensor
     focal_px: float
+    read_at: Tensor
+    longest_step: float
+
+    def field(self, parity: int) -> RayMap:
+        """Every second row, from row `parity` on."""
+        height, width = self.xy.shape[:2]
+        jacobian = self.jacobian.view(height, width, 4)[parity::2].reshape(-1, 4)
+        xy = self.xy[parity::2].contiguous()
+        return RayMap(xy, jacobian, self.focal_px, self.read_at[parity::2], self.longest_step)
 
 
 @dataclass(frozen=True)
@@ -38,7 +64,8 @@ class InstrumentPoses:
     """An instrument in one camera: axis point at s = 0, direction, side of the jaws (B, R, 3); coordinates of ends (B,
     R); float64, mm.
 
-    R is 1, or the number of groups of rows that are read at different times.
+    R is 1, or the number of groups of rows that are read at different times. `sweep` holds the same instrument one
+    sigma of the exposure earlier and later; None: the exposure takes no time.
     """
 
     p_axis: Tensor
@@ -48,6 +75,31 @@ class InstrumentPoses:
     s_head: Tensor
     radius: float
     wrist_ratio: float
+    sweep: tuple[InstrumentPoses, InstrumentPoses] | None = None
+
+    def unbind(self) -> tuple[InstrumentPoses, ...]:
+        """The same for every index of a further leading axis."""
+        arrays = (self.p_axis, self.v_axis, self.side, self.s_end, self.s_head)
+        return tuple(
+            InstrumentPoses(*parts, radius=self.radius, wrist_ratio=self.wrist_ratio)
+            for parts in zip(*arrays, strict=True)
+        )
+
+    def cylinders(self, camera_p_light: Tensor) -> Cylinders:
+        """The axes of all poses as cylinders."""
+        p, v = self.p_axis.flatten(0, 1), self.v_axis.flatten(0, 1)
+        cylinders = make_cylinders(p, v, camera_p_light.expand_as(p))
+        if self.sweep is None:
+            return cylinders
+        early, late = (poses.cylinders(camera_p_light) for poses in self.sweep)
+        return replace(cylinders, sweep=(early, late))
+
+    def motion_px(self, focal_px: float) -> Tensor | None:
+        """How far the head point moves in the picture over the exposure, 1 sigma, (B * R, 2)."""
+        if self.sweep is None:
+            return None
+        early, late = (_image(pose.p_axis + pose.s_head[..., None] * pose.v_axis) for pose in self.sweep)
+        return (0.5 * focal_px * (late - early)).flatten(0, 1).float()
 
 
 @dataclass(frozen=True)
@@ -60,21 +112,28 @@ class Brush:
     gamma: float
 
 
-def gather_pixels(brush: Brush, planes: Tensor) -> tuple[Tensor, Pixels]:
+def gather_pixels(brush: Brush, planes: Tensor, motion_px: Tensor | None = None) -> tuple[Tensor, Pixels]:
     """Flat indices (M,) into (B, H, W), and the pixels, on the positive side of all planes (B, R, P, 3) or a margin
     outside.
 
-    The planes' (x, y) parts are unit: values are distances in normalised coordinates.
+    The planes' (x, y) parts are unit: values are distances in normalised coordinates. `motion_px` (K, 2) over the
+    exposure widens the margin.
     """
     height, width = brush.rays.xy.shape[:2]
     batch, rows, count = planes.shape[:3]
-    group = torch.arange(height, device=planes.device) * rows // height
-    margin = MARGIN_PX * max(1.0, brush.blur_px) / brush.rays.focal_px
-    x, y = brush.rays.xy.unbind(-1)
-    mask = torch.ones((batch, height, width), dtype=torch.bool, device=planes.device)
+    group = (brush.rays.read_at * rows).long().clamp(max=rows - 1)
+    blur_px = brush.blur_px if motion_px is None else float(smeared(brush.blur_px, motion_px.norm(dim=-1)).max())
+    margin = MARGIN_PX * max(1.0, blur_px) / brush.rays.focal_px
+    # One pixel decides for its neighbours in the row; the margin holds for the furthest of them.
+    blocks = -(-width // GATHER_PX)
+    middle = (torch.arange(blocks, device=planes.device) * GATHER_PX + GATHER_PX // 2).clamp(max=width - 1)
+    x, y = brush.rays.xy[:, middle].unbind(-1)
+    margin += (GATHER_PX // 2) * brush.rays.longest_step
+    mask = torch.ones((batch, height, blocks), dtype=torch.bool, device=planes.device)
     for i in range(count):
         plane = planes[:, group, i, :, None].float()
         mask &= torch.addcmul(plane[:, :, 2] + plane[:, :, 0] * x, plane[:, :, 1], y) > -margin
+    mask = mask.repeat_interleave(GATHER_PX, dim=2)[..., :width]
     flat = mask.flatten().nonzero()[:, 0]
     inside = flat % (height * width)
     image = torch.div(flat, height * width, rounding_mode="floor")
@@ -105,20 +164,23 @@ def _outline(poses: InstrumentPoses) -> Tensor:
 
 def draw_instrument(picture: Tensor, brush: Brush, poses: InstrumentPoses, finish: Finish) -> None:
     """Paint the instrument over `picture` (B, H, W, 3), encoded values 0 to 1, in place."""
-    flat, pixels = gather_pixels(brush, _outline(poses))
+    motion_px = poses.motion_px(brush.rays.focal_px)
+    flat, pixels = gather_pixels(brush, _outline(poses), motion_px)
     if not len(flat):
         return
     values = picture.view(-1, 3)
     p, v = poses.p_axis.flatten(0, 1), poses.v_axis.flatten(0, 1)
     s_end, s_head = poses.s_end.flatten(), poses.s_head.flatten()
-    cylinders = make_cylinders(p, v, brush.camera_p_light.expand_as(p))
+    cylinders = poses.cylinders(brush.camera_p_light)
+    slide_px = None if motion_px is None else _slide_px(poses, motion_px)
     shaft = _Part(poses.radius, finish.shaft, torch.full_like(s_end, -1e4).float(), s_end.float())
     hit = hit_cylinder(pixels, cylinders, shaft.radius, brush.blur_px)
     # Wrist and jaws can only show where the shaft has ended or nearly so: a quarter of the pixels.
     tip = (hit.s > (shaft.s_to - COVERED_MM)[pixels.pose]).nonzero()[:, 0]
     near = Pixels(pixels.xy[tip], pixels.jacobian[tip], pixels.pose[tip])
     colour = values[flat]
-    beyond = _jaws(colour[tip], brush, near, p + s_head[:, None] * v, v, poses.side.flatten(0, 1))
+    head = p + s_head[:, None] * v
+    beyond = _jaws(colour[tip], brush, near, head, v, poses.side.flatten(0, 1), motion_px)
     s_sleeve = s_end + 0.55 * (s_head - s_end)
     for ratio, surface, s_from, s_to in (
         (CLEVIS_RATIO, finish.clevis, s_sleeve - 1.0, s_head + 1.0),
@@ -126,9 +188,22 @@ def draw_instrument(picture: Tensor, brush: Brush, poses: InstrumentPoses, finis
     ):
         part = _Part(ratio * poses.radius, surface, s_from.float(), s_to.float())
         part_hit = hit_cylinder(near, cylinders, part.radius, brush.blur_px)
-        beyond = _paint(beyond, brush, near, part_hit, cylinders.light, part)
+        beyond = _paint(beyond, brush, near, part_hit, cylinders.light, part, slide_px)
     colour[tip] = beyond
-    values[flat] = _paint(colour, brush, pixels, hit, cylinders.light, shaft)
+    values[flat] = _paint(colour, brush, pixels, hit, cylinders.light, shaft, slide_px)
+
+
+def _image(p: Tensor) -> Tensor:
+    """Normalised coordinates (..., 2) of points (..., 3)."""
+    return p[..., :2] / p[..., 2:].clamp_min(1.0)
+
+
+def _slide_px(poses: InstrumentPoses, motion_px: Tensor) -> Tensor:
+    """How far the head moves along the axis in the picture over the exposure, 1 sigma, (K,)."""
+    tip = _image(poses.p_axis + poses.s_head[..., None] * poses.v_axis)
+    before = _image(poses.p_axis + (poses.s_head - 10.0)[..., None] * poses.v_axis)
+    along = torch.nn.functional.normalize(tip - before, dim=-1).flatten(0, 1)
+    return (along * motion_px).sum(-1).float()
 
 
 @dataclass(frozen=True)
@@ -141,21 +216,33 @@ class _Part:
     s_to: Tensor
 
 
-def _paint(colour: Tensor, brush: Brush, pixels: Pixels, hit: Hit, light: Tensor, part: _Part) -> Tensor:
-    """Paint a part where rays hit it over colours (M, 3); light (K, 3) in the cylinders' frames."""
-    before = edge((part.s_to[pixels.pose] - hit.s) / hit.s_per_px, brush.blur_px)
-    after = edge((hit.s - part.s_from[pixels.pose]) / hit.s_per_px, brush.blur_px)
+def _paint(
+    colour: Tensor, brush: Brush, pixels: Pixels, hit: Hit, light: Tensor, part: _Part, slide_px: Tensor | None
+) -> Tensor:
+    """Paint a part where rays hit it over colours (M, 3); light (K, 3) in the cylinders' frames; its ends move by
+    `slide_px` (K,) over the exposure."""
+    blur = brush.blur_px if slide_px is None else smeared(brush.blur_px, slide_px)[pixels.pose]
+    before = edge((part.s_to[pixels.pose] - hit.s) / hit.s_per_px, blur)
+    after = edge((hit.s - part.s_from[pixels.pose]) / hit.s_per_px, blur)
     cover = (hit.inside * before * after)[:, None]
     return torch.lerp(colour, light_cylinder(hit, light[pixels.pose], part.surface, brush.gamma), cover)
 
 
-def _jaws(colour: Tensor, brush: Brush, pixels: Pixels, head: Tensor, v_axis: Tensor, side: Tensor) -> Tensor:
+def _jaws(
+    colour: Tensor,
+    brush: Brush,
+    pixels: Pixels,
+    head: Tensor,
+    v_axis: Tensor,
+    side: Tensor,
+    motion_px: Tensor | None,
+) -> Tensor:
     """Paint the two jaws, rods that open about the head point, over colours (M, 3)."""
     for sign in (-1.0, 1.0):
         angle = torch.tensor(sign * JAW_OPENING_RAD)
         tip = head + JAW_LENGTH_MM * (torch.cos(angle) * v_axis + torch.sin(angle) * side)
         inside, normal, point = hit_capsule(
-            pixels, head.float(), tip.float(), JAW_RADIUS_MM, brush.blur_px, brush.rays.focal_px
+            pixels, head.float(), tip.float(), JAW_RADIUS_MM, brush.blur_px, brush.rays.focal_px, motion_px
         )
         facing = torch.clamp(dot3(normal, unit3(brush.camera_p_light.float() - point)), min=0.0)
         linear = torch.clamp(0.04 + 0.30 * facing + 0.6 * facing**24, max=1.0)

@@ -20,20 +20,37 @@ SAMPLE_COLUMNS = 1024
 
 @dataclass(frozen=True)
 class LoopPoses:
-    """A tube between two points (B, R, 3), and the light (B, R, 3), all in the camera; float32, mm."""
+    """A tube between two points (B, R, 3) in the camera; float32, mm.
+
+    `sweep` holds it one sigma of the exposure earlier and later; None: the exposure takes no time.
+    """
 
     a: Tensor
     b: Tensor
     radius: float
+    sweep: tuple[LoopPoses, LoopPoses] | None = None
+
+    def unbind(self) -> tuple[LoopPoses, ...]:
+        """The same for every index of a further leading axis."""
+        return tuple(LoopPoses(a, b, self.radius) for a, b in zip(self.a, self.b, strict=True))
+
+    def motion_px(self, focal_px: float) -> Tensor | None:
+        """How far its middle moves in the picture over the exposure, 1 sigma, (B * R, 2)."""
+        if self.sweep is None:
+            return None
+        early, late = (0.5 * (loop.a + loop.b) for loop in self.sweep)
+        shift = late[..., :2] / late[..., 2:].clamp_min(1.0) - early[..., :2] / early[..., 2:].clamp_min(1.0)
+        return (0.5 * focal_px * shift).flatten(0, 1)
 
 
 def draw_loop(picture: Tensor, brush: Brush, loop: LoopPoses, tissue: Tissue) -> None:
     """Paint the tube over `picture` (B, H, W, 3), encoded values 0 to 1, in place, with the colours of the tissue."""
-    flat, pixels = gather_pixels(brush, _outline(loop))
+    motion_px = loop.motion_px(brush.rays.focal_px)
+    flat, pixels = gather_pixels(brush, _outline(loop), motion_px)
     if not len(flat):
         return
     a, b = loop.a.flatten(0, 1).float(), loop.b.flatten(0, 1).float()
-    inside, normal, point = hit_capsule(pixels, a, b, loop.radius, brush.blur_px, brush.rays.focal_px)
+    inside, normal, point = hit_capsule(pixels, a, b, loop.radius, brush.blur_px, brush.rays.focal_px, motion_px)
     along = dot3(point - a[pixels.pose], unit3(b - a)[pixels.pose])
     across = loop.radius * torch.asin(torch.clamp(normal[:, 1], -1.0, 1.0))
     grid = torch.stack([along + 20.0, 1.3 * across - 35.0], dim=-1) / HALF_EXTENT_MM

@@ -37,12 +37,21 @@ class Cylinders:
         distance: (K,) of the axis from the camera.
         s_foot: (K,) axis coordinate of the nearest point.
         light: (K, 3) the light, in `frame`.
+        sweep: the same cylinders one sigma of the exposure earlier and later; None: they do not move.
     """
 
     frame: Tensor
     distance: Tensor
     s_foot: Tensor
     light: Tensor
+    sweep: tuple[Cylinders, Cylinders] | None = None
+
+    def contour_planes(self, radius: float) -> tuple[Tensor, Tensor]:
+        """Unit normals (K, 3) of the planes of both contours, positive inside."""
+        sine = (radius / self.distance)[:, None]
+        cosine = torch.sqrt(1.0 - sine * sine)
+        u, w = sine * self.frame[:, 0], cosine * self.frame[:, 1]
+        return u + w, u - w
 
 
 def make_cylinders(p_axis: Tensor, v_axis: Tensor, light: Tensor) -> Cylinders:
@@ -68,9 +77,14 @@ def unit3(a: Tensor) -> Tensor:
     return a * torch.rsqrt(dot3(a, a).clamp_min(1e-20))[..., None]
 
 
-def edge(signed_px: Tensor, blur_px: float) -> Tensor:
+def edge(signed_px: Tensor, blur_px: float | Tensor) -> Tensor:
     """Coverage of a half-plane whose border is `signed_px` away (positive: inside), seen through the point spread."""
     return 0.5 + 0.5 * torch.erf(signed_px * (0.7071067811865476 / blur_px))
+
+
+def smeared(blur_px: float, shift_px: Tensor) -> Tensor:
+    """Point spread (M,) of an edge that moves by `shift_px` (1 sigma over the exposure) across itself."""
+    return torch.sqrt(blur_px * blur_px + shift_px * shift_px)
 
 
 def _slope_px(gradient_x: Tensor, gradient_y: Tensor, jacobian: Tensor) -> Tensor:
@@ -120,13 +134,7 @@ def hit_cylinder(pixels: Pixels, cylinders: Cylinders, radius: float, blur_px: f
     facing = torch.clamp(nu * du + nw * dw, max=-FACING_LIMIT)
     slide = -dv / facing  # implicit derivative of the hit along the surface
     gx, gy = (t * (slide * (nu * frame[:, 0, i] + nw * frame[:, 1, i]) + frame[:, 2, i]) for i in range(2))
-    sine = radius / distance
-    cosine = torch.sqrt(1.0 - sine * sine)
-    inside = -1.0
-    for sign in (1.0, -1.0):
-        nx, ny = (sign * cosine * frame[:, 1, i] + sine * frame[:, 0, i] for i in range(2))
-        value = sign * cosine * dw + sine * du
-        inside = inside + edge(value / _slope_px(nx, ny, pixels.jacobian), blur_px)
+    inside = _between_contours(pixels, cylinders, radius, blur_px)
     in_front = (t > 0).float()
     depth = t
     point = torch.stack([t * du, t * dw, t * dv], dim=-1)
@@ -134,12 +142,39 @@ def hit_cylinder(pixels: Pixels, cylinders: Cylinders, radius: float, blur_px: f
     return Hit(s, _slope_px(gx, gy, pixels.jacobian), inside, torch.stack([nu, nw], dim=-1), point, depth)
 
 
+def _between_contours(pixels: Pixels, cylinders: Cylinders, radius: float, blur_px: float) -> Tensor:
+    """Coverage (M,) by both contours: the sum of both edges, less one."""
+    sides = []
+    swept = [c.contour_planes(radius) for c in cylinders.sweep or ()]
+    for side, plane in enumerate(cylinders.contour_planes(radius)):
+        value, slope_px = _plane_at(pixels, plane)
+        blur = blur_px
+        if swept:
+            shift, _ = _plane_at(pixels, 0.5 * (swept[1][side] - swept[0][side]))
+            blur = smeared(blur_px, shift / slope_px)
+        sides.append(edge(value / slope_px, blur))
+    return sides[0] + sides[1] - 1.0
+
+
+def _plane_at(pixels: Pixels, plane: Tensor) -> tuple[Tensor, Tensor]:
+    """Values (M,) of planes (K, 3) on the rays, and how much they change by the pixel."""
+    nx, ny, nz = plane.T.contiguous()[:, pixels.pose]
+    return nx * pixels.xy[:, 0] + ny * pixels.xy[:, 1] + nz, _slope_px(nx, ny, pixels.jacobian)
+
+
 def hit_capsule(
-    pixels: Pixels, a: Tensor, b: Tensor, radius: float, blur_px: float, focal_px: float
+    pixels: Pixels,
+    a: Tensor,
+    b: Tensor,
+    radius: float,
+    blur_px: float,
+    focal_px: float,
+    motion_px: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Coverage (M,), unit normal (M, 3) and point (M, 3) of round-ended rods from a to b (K, 3), in camera coordinates.
 
     The outline of a sphere-swept segment is where the ray comes as near to the segment as the radius: exact.
+    `motion_px` (K, 2) is how far the rods move in the picture over the exposure, 1 sigma.
     """
     a, e = a[pixels.pose], (b - a)[pixels.pose]
     d = unit3(torch.cat([pixels.xy, torch.ones_like(pixels.xy[:, :1])], dim=-1))
@@ -149,7 +184,11 @@ def hit_capsule(
     along = dot3(d, nearest)
     offset = along[:, None] * d - nearest  # from the segment to the ray
     gap = torch.sqrt(dot3(offset, offset))
-    inside = edge((radius - gap) / along.clamp_min(1.0) * focal_px, blur_px)
     lift = torch.sqrt(torch.clamp(1.0 - (gap / radius) ** 2, min=0.0))
     normal = offset / gap.clamp_min(radius)[:, None] - lift[:, None] * d
+    blur = blur_px
+    if motion_px is not None:
+        motion = motion_px[pixels.pose]
+        blur = smeared(blur_px, normal[:, 0] * motion[:, 0] + normal[:, 1] * motion[:, 1])
+    inside = edge((radius - gap) / along.clamp_min(1.0) * focal_px, blur)
     return inside, normal, nearest + radius * normal

@@ -32,6 +32,18 @@ def rotation_from_rotvec(rotvec: ArrayLike) -> Array:
     return np.eye(3) + first * skew + second * (skew @ skew)
 
 
+def rotation_about(axis: int, angle_rad: ArrayLike) -> Array:
+    """Rotation matrices (..., 3, 3) about a coordinate axis (0, 1, 2 for x, y, z) by angles (...)."""
+    angle = np.asarray(angle_rad, dtype=np.float64)
+    cosine, sine = np.cos(angle), np.sin(angle)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    out = np.zeros((*angle.shape, 3, 3))
+    out[..., axis, axis] = 1.0
+    out[..., i, i] = out[..., j, j] = cosine
+    out[..., i, j], out[..., j, i] = -sine, sine
+    return out
+
+
 def rigid(rotation: ArrayLike, translation: ArrayLike) -> Array:
     """Homogeneous transforms (..., 4, 4) from rotations (..., 3, 3) and translations (..., 3), mm."""
     R = np.asarray(rotation, dtype=np.float64)
@@ -102,8 +114,8 @@ def dh_matrix(joint: Joint, reading: ArrayLike, convention: Convention) -> Array
     zero = np.zeros_like(value)
     theta = joint.theta_rad + (value if joint.kind == "revolute" else zero)
     d = joint.d_mm + (value if joint.kind == "prismatic" else zero)
-    about_z = rigid(rotation_from_rotvec(np.stack([zero, zero, theta], -1)), np.stack([zero, zero, d], -1))
-    about_x = rigid(rotation_from_rotvec([joint.alpha_rad, 0.0, 0.0]), [joint.a_mm, 0.0, 0.0])
+    about_z = rigid(rotation_about(2, theta), np.stack([zero, zero, d], -1))
+    about_x = rigid(rotation_about(0, joint.alpha_rad), [joint.a_mm, 0.0, 0.0])
     return about_x @ about_z if convention == "modified" else about_z @ about_x
 
 

@@ -55,8 +55,6 @@ class CameraSettings:
     """Radius of the bright field over half the picture's width, black outside; 0: the whole picture is bright."""
     exposure_s: NonNegative = 0.0
     """Exposure time: motion blur, centred on the frame's time."""
-    exposure_samples: Count = 4
-    """Instants averaged over the exposure."""
     readout_s: NonNegative = 0.0
     """Time from reading the first row to the last (rolling shutter); the middle row is read at the frame's time."""
     field_delay_s: NonNegative = 0.0

@@ -27,6 +27,8 @@ DEPTH_MM = 138.0
 REFERENCE_MM = 115.0
 """Distance at which the light gives the nominal brightness."""
 GLOSS_SHARPNESS = 220.0
+SMALLEST_SMEAR_PX = 0.1
+"""Motion of the tissue over the exposure below which it is left sharp."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,7 @@ def build_tissue(
 
 def coarse_nodes(width: int, height: int) -> Array:
     """Pixels (h, w, 2) of the coarse grid that covers the picture."""
-    rows, columns = (height - 2) // COARSE_PX + 2, (width - 2) // COARSE_PX + 2
+    rows, columns = (height - 1) // COARSE_PX + 2, (width - 1) // COARSE_PX + 2
     v, u = np.meshgrid(np.arange(rows) * COARSE_PX, np.arange(columns) * COARSE_PX, indexing="ij")
     return np.stack([u, v], axis=-1).astype(np.float64)
 
@@ -102,8 +104,10 @@ def intersect(tissue: Tissue, rays: Tensor, tissue_T_camera: Tensor, camera_p_li
     return CoarseView(point, to_light / distance[..., None], unit3(origin - point), distance)
 
 
-def shade(tissue: Tissue, view: CoarseView, gain: Tensor, size: tuple[int, int]) -> Tensor:
+def shade(tissue: Tissue, view: CoarseView, gain: Tensor, size: tuple[int, int], parity: int | None = None) -> Tensor:
     """Encoded picture (B, H, W, 3), 0 to 1, of the surface; `gain` (B, h, w) multiplies the encoded brightness.
+
+    With `parity` only every second row from that one on.
 
     Works in encoded values: a product of linear factors is a product of encoded ones, so only one root is taken a
     pixel.
@@ -111,17 +115,35 @@ def shade(tissue: Tissue, view: CoarseView, gain: Tensor, size: tuple[int, int])
     half = unit3(view.to_light + view.to_camera)
     coarse = torch.cat([view.points[..., :2] / HALF_EXTENT_MM, view.to_light, half, gain[..., None]], dim=-1)
     coarse = coarse.movedim(-1, 1).contiguous()
-    rows, columns = coarse.shape[2:]
+    rows = coarse.shape[2]
     # On the CPU in strips that stay in the cache: three times faster than whole pictures (0.4 against 1.3 ns a value).
     step = rows if gain.is_cuda else STRIP_NODES
-    picture = gain.new_empty(len(gain), *size, 3)
+    first, skip = (0, 1) if parity is None else (parity, 2)
+    picture = gain.new_empty(len(gain), len(range(first, size[0], skip)), size[1], 3)
     for row in range(0, rows - 1, step):
         nodes = coarse[:, :, row : row + step + 1]
-        strip = picture[:, row * COARSE_PX : (row + step) * COARSE_PX]
-        full = ((nodes.shape[2] - 1) * COARSE_PX + 1, (columns - 1) * COARSE_PX + 1)
-        fine = nnf.interpolate(nodes, size=full, mode="bilinear", align_corners=True)
+        strip = picture[:, row * COARSE_PX // skip : (row + step) * COARSE_PX // skip]
+        fine = refine(nodes, first, skip)
         _shade_strip(tissue, fine[..., : strip.shape[1], : strip.shape[2]], strip)
     return picture
+
+
+def refine(nodes: Tensor, first: int = 0, skip: int = 1) -> Tensor:
+    """Linear interpolation of (B, C, h, w) to (B, C, (h - 1) * COARSE_PX, (w - 1) * COARSE_PX), or of its rows `first`,
+    `first + skip`, ... only.
+
+    By hand: half the time of torch's bilinear interpolation (0.20 against 0.40 ms for a strip of 48 x 640 px).
+    """
+    count = nodes.shape[2]
+    at = torch.arange(first, (count - 1) * COARSE_PX, skip, device=nodes.device) / COARSE_PX
+    distance = (at[:, None] - torch.arange(count, device=nodes.device)).abs()
+    rows = (1.0 - distance).clamp_min(0.0) @ nodes  # (B, C, H, w)
+    left = rows[..., :-1]
+    step = rows[..., 1:] - left
+    fine = nodes.new_empty(*left.shape, COARSE_PX)
+    for i in range(COARSE_PX):
+        torch.add(left, step, alpha=i / COARSE_PX, out=fine[..., i])
+    return fine.flatten(-2)
 
 
 def _shade_strip(tissue: Tissue, fine: Tensor, out: Tensor) -> None:
@@ -152,3 +174,36 @@ def sample_texture(texture: Tensor, grid: Tensor) -> Tensor:
     maps = zip(x.numpy(), y.numpy(), strict=True)
     pictures = [cv2.remap(table, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT) for u, v in maps]
     return torch.from_numpy(np.stack(pictures))
+
+
+def smear(pictures: Tensor, motion_px: Tensor) -> Tensor:
+    """Pictures (B, H, W, 3) averaged along a motion (B, 2) of 1 sigma, px, by three taps with that spread."""
+    smeared = []
+    for picture, motion in zip(pictures, motion_px.tolist(), strict=True):
+        kernel = _smear_kernel(motion)
+        if kernel.size == 1:
+            smeared.append(picture)
+        elif picture.is_cuda:
+            weights = picture.new_tensor(kernel).expand(3, 1, -1, -1)
+            reach = (kernel.shape[1] // 2, kernel.shape[1] // 2, kernel.shape[0] // 2, kernel.shape[0] // 2)
+            padded = nnf.pad(picture.movedim(-1, 0)[None], reach, mode="reflect")
+            smeared.append(nnf.conv2d(padded, weights, groups=3)[0].movedim(0, -1))
+        else:
+            smeared.append(
+                torch.from_numpy(cv2.filter2D(picture.numpy(), -1, kernel, borderType=cv2.BORDER_REFLECT_101))
+            )
+    return torch.stack(smeared).contiguous()
+
+
+def _smear_kernel(motion_px: list[float]) -> Array:
+    """Weights, odd in both sizes, of three taps at -m, 0 and m with m^2 a half more than the variance asked for; a tap
+    between pixels is shared by its neighbours."""
+    u, v = (float(np.sqrt(1.5)) * m for m in motion_px)
+    reach_u, reach_v = (0 if abs(m) < SMALLEST_SMEAR_PX else int(np.ceil(abs(m))) for m in (u, v))
+    kernel = np.zeros((2 * reach_v + 1, 2 * reach_u + 1), dtype=np.float32)
+    for sign in (-1.0, 0.0, 1.0):
+        x, y = sign * u * bool(reach_u) + reach_u, sign * v * bool(reach_v) + reach_v
+        for row in {int(np.floor(y)), int(np.ceil(y))}:
+            for column in {int(np.floor(x)), int(np.ceil(x))}:
+                kernel[row, column] += (1.0 - abs(x - column)) * (1.0 - abs(y - row)) / 3.0
+    return kernel
