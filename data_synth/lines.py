@@ -16,13 +16,18 @@ SHORTEST_VISIBLE_MM = 10.0
 """A shaft of which less is in the picture is not measured."""
 
 
-def simulate_lines(config: LineStudyConfig) -> dict[str, Any]:
+def simulate_lines(config: LineStudyConfig, readings: tuple[Array, Array] | None = None) -> dict[str, Any]:
     """Observations of `config.trials` independent trials in the keys of an observations file, each with a leading
     trials axis.
 
     Noise: the given `arm_T_rcm` is the true one right-multiplied by (exp(eps), eps); each camera sees the true pose of
     the RCM frame, right-multiplied in the same way and independently (`camera_noise_*`); the given stereo extrinsics
     are the true ones right-multiplied once a trial; then every image point gets isotropic Gaussian noise.
+
+    Args:
+        config: scene, noise and number of trials.
+        readings: of the laparoscope's and of the instrument's joints, (N, 3) each, rad and mm; otherwise those of the
+            configuration's motion.
 
     Returns:
         arrays (trials, N, ...) and scalars, plus `truth`: camera_right_T_arm (trials, 4, 4), camera_left_T_camera_right
@@ -32,7 +37,7 @@ def simulate_lines(config: LineStudyConfig) -> dict[str, Any]:
     """
     generator = np.random.default_rng(config.seed)
     scene = build_scene(config.scene)
-    poses = _true_poses(config, scene, generator)
+    poses = _true_poses(config, scene, generator) if readings is None else poses_at(scene, *readings)
     trials, n = config.trials, poses.rcm_v_axis.shape[-2]
     camera_right_T_arm = _hand_eye(config, scene, generator)[:, None]
     camera_right_T_rcm = scene.camera_right_T_arm @ poses.arm_T_rcm

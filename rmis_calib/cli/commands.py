@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from rmis_calib.cli import EXIT_NOT_TRUSTWORTHY, EXIT_OK
-from rmis_calib.cli.console import ProgressCallback, console, print_table, progress_reporter
+from rmis_calib.cli.console import ProgressCallback, console, print_advice, print_table, progress_reporter
 from rmis_calib.config import CalibrationConfig, load_config
 
 if TYPE_CHECKING:
@@ -280,6 +280,8 @@ def conclude(result: "CalibrationResult", written: Path) -> int:
     """Print the answer and where it is; the exit code says whether to trust it."""
     console.print(f"[bold]{result.status}[/bold]: {result.message}\n", soft_wrap=True)
     print_table(result.camera_right_T_arm.name if result.camera_right_T_arm else "no transform", result_rows(result))
+    if not result.trustworthy:
+        print_advice(result.observability.get("advice") or [])
     console.print(f"written: {written}\n", soft_wrap=True)
     return EXIT_OK if result.trustworthy else EXIT_NOT_TRUSTWORTHY
 

@@ -56,3 +56,12 @@ def print_table(title: str, rows: list[tuple[str, str]]) -> None:
     for name, value in rows:
         table.add_row(name, value)
     console.print(table)
+
+
+def print_advice(sentences: list[str]) -> None:
+    """What would make the next recording better, one line a step; nothing where there is no advice."""
+    if sentences:
+        console.print("what to record next", soft_wrap=True)
+        for sentence in sentences:
+            console.print(f"  {sentence}", soft_wrap=True, markup=False)
+        console.print()

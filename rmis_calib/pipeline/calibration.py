@@ -17,6 +17,7 @@ from rmis_calib.pipeline.estimation import (
     estimate,
     estimate_with_kinematics,
     make_result,
+    problem_of,
     raise_unless_trustworthy,
     residual_arrays,
     residual_record,
@@ -24,6 +25,13 @@ from rmis_calib.pipeline.estimation import (
 )
 from rmis_calib.pipeline.evaluation import head_point_errors, summarise_head_points
 from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
+from rmis_calib.pipeline.next_motion import (
+    advice_record,
+    camera_view,
+    joint_candidates,
+    limits_in_words,
+    may_advise,
+)
 from rmis_calib.pipeline.observing import (
     Choice,
     assemble,
@@ -139,7 +147,9 @@ def run_calibration(
         if better is None or all(new.same_as(old) for new, old in zip(better, run.choices, strict=True)):
             break
         run = _solve_choice(recording, draft, views, poses, better, progress)
-    return run if draft == config else _solve_choice(recording, config, views, poses, run.choices, progress)
+    if draft != config:
+        run = _solve_choice(recording, config, views, poses, run.choices, progress)
+    return _advised(run, config)
 
 
 def _without_joint_offsets(config: CalibrationConfig) -> CalibrationConfig:
@@ -190,6 +200,25 @@ def _solve_choice(
     }
     result = replace(result, residuals=residuals, head_point_error_px=summarise_head_points(errors))
     return CalibrationRun(result, recording, views, poses, choices, observations, solution)
+
+
+def _advised(run: CalibrationRun, config: CalibrationConfig) -> CalibrationRun:
+    """The run with the motions in its result that would help most."""
+    if run.observations is None or run.solution is None or not may_advise(run.solution, config):
+        return run
+    problem = problem_of(run.observations, config)
+    used, _ = used_motions(run.solution)
+    unknowns = KinematicUnknowns(run.recording, run.poses.frames, config.device)
+    settings = config.solver.advice
+    candidates = joint_candidates(
+        run.recording, unknowns, problem, run.solution, used, settings, seed=config.solver.seed
+    )
+    stereo = run.recording.stereo
+    cameras = [camera for camera in (stereo.right, stereo.left) if camera is not None][: problem.n_cameras]
+    view = torch.stack([camera_view(camera) for camera in cameras]).to(config.device)
+    record = advice_record(run.solution, candidates, view, config, limits_in_words(settings))
+    result = replace(run.result, observability=run.result.observability | record)
+    return replace(run, result=result)
 
 
 def _kinematic_unknowns(

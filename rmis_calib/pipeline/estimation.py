@@ -1,5 +1,6 @@
 """Observations to the answer: the solver's tensors turned into a result with frames, units and a status."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,8 @@ from rmis_calib.geometry.rigid import RigidTransform
 from rmis_calib.io import ShaftObservations
 from rmis_calib.pipeline.device import require_device
 from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
+from rmis_calib.pipeline.next_motion import advice_record, may_advise, seen_view
+from rmis_calib.pipeline.next_pose import WHERE, pose_candidates
 from rmis_calib.results import STATUS_SENTENCES, CalibrationResult, Motions, Status
 from rmis_calib.solver import Problem, Solution, SolveStatus
 from rmis_calib.solver import solve as solve_problem
@@ -47,14 +50,27 @@ def solve(
     solution = estimate(observations, config)
     motions = Motions(*used_motions(solution))
     result = make_result(solution, motions, residuals_normalised(solution, motions.used), config)
+    result = replace(result, observability=result.observability | _advice(solution, motions, observations, config))
     if throw:
         raise_unless_trustworthy(result)
     return result
 
 
+def _advice(
+    solution: Solution, motions: Motions, observations: ShaftObservations, config: CalibrationConfig
+) -> dict[str, Any]:
+    """What motion would help most, as the picture shows it."""
+    if not may_advise(solution, config) or not motions.used.any():
+        return {}
+    problem = problem_of(observations, config).flatten_batch()
+    last = int(np.flatnonzero(motions.used)[-1])
+    candidates = pose_candidates(problem, solution, last, config.solver.advice)
+    return advice_record(solution, candidates, seen_view(problem), config, WHERE)
+
+
 def estimate(observations: ShaftObservations, config: CalibrationConfig) -> Solution:
     """Run the configured solver on the configured kinds of measurement."""
-    return solve_problem(_problem(observations, config), config.solver)
+    return solve_problem(problem_of(observations, config), config.solver)
 
 
 def estimate_with_kinematics(
@@ -67,7 +83,7 @@ def estimate_with_kinematics(
     would else be counted as uncertainty of a transform that absorbs it anyway. With `auto` all offsets are left out
     when a robot without any explains the data better; the covariance then allows for the other possibility.
     """
-    base = _problem(observations, config).flatten_batch()
+    base = problem_of(observations, config).flatten_batch()
     asked = config.solver.unknowns
     sigma = unknowns.prior_sigma(asked)
     if asked.joint_offsets == "never":
@@ -133,7 +149,8 @@ def _clock_start(base: Problem, unknowns: KinematicUnknowns, reach_s: float, lik
     return best_s if better else 0.0
 
 
-def _problem(observations: ShaftObservations, config: CalibrationConfig) -> Problem:
+def problem_of(observations: ShaftObservations, config: CalibrationConfig) -> Problem:
+    """The configured kinds of measurement as the solver's tensors."""
     return Problem.from_observations(observations, device=config.device).only(*config.measurements)
 
 

@@ -53,9 +53,16 @@ class KinematicUnknowns:
         """Prior of each offset, rad or mm; zero for a joint that does not move the shaft."""
         sigma = {"rad": np.deg2rad(settings.joint_offset_sigma_deg), "mm": settings.joint_offset_sigma_mm}
         values = [sigma[column.rpartition("_")[2]] for column in self.columns]
-        readings, _ = self._readings(torch.zeros(1, dtype=torch.float64))
-        moves = self._derivative(readings).abs().amax(dim=(0, 1, 2)) * self._steps / self._steps.max() > _MOVES_MM
-        return torch.where(moves, torch.tensor(values, dtype=torch.float64, device=self._device), 0.0)
+        return torch.where(self.moves_shaft(), torch.tensor(values, dtype=torch.float64, device=self._device), 0.0)
+
+    def moves_shaft(self) -> Bool[Tensor, " j"]:
+        """Which joints move the shaft as the camera sees it; those of the wrist do not."""
+        derivative = self._derivative(self._readings(torch.zeros(1, dtype=torch.float64))[0])
+        return derivative.abs().amax(dim=(0, 1, 2)) * self._steps / self._steps.max() > _MOVES_MM
+
+    def readings_of_motions(self, clock_s: float) -> Float[Tensor, "m j"]:
+        """Logged readings of every motion, rad or mm."""
+        return self._readings(torch.tensor([clock_s], dtype=torch.float64))[0][0]
 
     def at(self, base: Problem, joint_offset: Float[Tensor, "b j"], clock_s: Float[Tensor, " b"]) -> Problem:
         """The measurements of `base` with the kinematics evaluated at `b` sets of offsets.
@@ -93,6 +100,20 @@ class KinematicUnknowns:
             joint_derivative=derivative,
             joint_offset_sigma=sigma.expand(len(clock_s), -1),
             clock_derivative=(derivative @ self._velocity(clock_s)[..., None])[..., 0] if self.has_clock else None,
+        )
+
+    def resting_at(self, base: Problem, readings: Float[Tensor, "m j"], joint_offset: Float[Tensor, " j"]) -> Problem:
+        """The motions of `base` (one trial) with the arms at rest at these readings; rad or mm, offsets to be added."""
+        arm_T_rcm, v, s_end, p_head = self._poses(readings + joint_offset)
+        derivative = self._derivative((readings + joint_offset)[None])
+        return replace(
+            base,
+            arm_T_rcm=arm_T_rcm[None],
+            rcm_v_axis=v[None],
+            rcm_s_end_mm=s_end[None],
+            rcm_p_head=p_head[None],
+            joint_derivative=derivative,
+            clock_derivative=torch.zeros_like(derivative[..., 0]),
         )
 
     def motion_poses(

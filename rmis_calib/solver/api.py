@@ -142,5 +142,5 @@ def _shaped(solution: Solution, batch: torch.Size) -> Solution:
             return replace(value, **{k: shaped(v) for k, v in vars(value).items() if isinstance(v, Tensor)})
         return value
 
-    names = [name for name in vars(solution) if name not in ("sight", "history")]
+    names = [name for name in vars(solution) if name not in ("sight", "posterior", "history")]
     return replace(solution, **{name: shaped(getattr(solution, name)) for name in names})

@@ -18,7 +18,7 @@ from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.residuals import State, residual_rows
 from rmis_calib.solver.robust import REJECTED
 from rmis_calib.solver.settings import SolverSettings, UnknownSettings
-from rmis_calib.solver.solution import MotionReason, Nuisance, Rival, Sight, Solution, SolveStatus
+from rmis_calib.solver.solution import MotionReason, Nuisance, Posterior, Rival, Sight, Solution, SolveStatus
 from rmis_calib.solver.unknowns import TRANSLATION_SIGMA_MM, UNITS, Nominal, initial_state, make_layout
 from rmis_calib.solver.variance import COMPONENTS, assumed_noise
 
@@ -125,6 +125,7 @@ def joint_solution(fit: JointFit, settings: SolverSettings, rival: Rival | None 
         bias=fit.bias[:, :6],
         history=fit.history,
         sight=_sight(fit.problem, state.R, state.t, C, fit.noise, uses, settings),
+        posterior=_posterior(fit, excess.clamp_min(1.0)),
         residual_lines=shown.lines,
         residual_ends=shown.ends,
         residual_heads=shown.heads,
@@ -140,6 +141,12 @@ def _mixed(
     gap = torch.cat((matrix_to_rotvec(T[:, :3, :3] @ R.mT), T[:, :3, 3] - t), dim=-1)
     weight = rival.probability.reshape(-1, 1, 1)
     return (1.0 - weight) * C + weight * (rival.covariance.reshape(-1, 6, 6) + gap[:, :, None] * gap[:, None])
+
+
+def _posterior(fit: JointFit, excess: Float[Tensor, " b"]) -> Posterior:
+    """The fit with all variances `excess` times as large."""
+    noise = NoiseModel(**{name: value * excess for name, value in vars(fit.noise).items()})
+    return Posterior(fit.state, fit.layout, noise, fit.information / excess[:, None, None])
 
 
 def _judge(fit: JointFit) -> tuple[Int[Tensor, " b"], Int[Tensor, "b n"], Float[Tensor, " b"]]:

@@ -48,6 +48,7 @@ class JointFit:
     layout: Layout
     noise: NoiseModel
     covariance: Float[Tensor, "b p p"]
+    information: Float[Tensor, "b p p"]
     chi2: Float[Tensor, " b"]
     rows: Float[Tensor, " b"]
     weight: Float[Tensor, "c b n"]
@@ -169,6 +170,7 @@ def _finish(
         layout=layout,
         noise=noise,
         covariance=covariance,
+        information=information,
         chi2=normal.chi2,
         rows=normal.rows,
         weight=weight_all,

@@ -48,6 +48,22 @@ _SENTENCES = {
 }
 
 
+_REMEDIES = {
+    Degeneracy.STATIC_LAPAROSCOPE: "move the laparoscope's arm as well, with its joints logged",
+    Degeneracy.NO_DEPTH_CUE: "give the shaft's diameter, so that its width in the picture tells its distance",
+    Degeneracy.SINGLE_AXIS_MOTION: "turn the instrument about a second axis",
+    Degeneracy.ONE_PLANE: "move the instrument out of the plane that it stayed in",
+    Degeneracy.MOTION_BELOW_NOISE: "move farther: several degrees and centimetres",
+    Degeneracy.SHORT_BASELINE: "use the shaft's diameter for the distance, as with one camera",
+    Degeneracy.NO_ALONG_AXIS_CUE: "keep the end of the dark shaft in view, or label head points",
+}
+
+
+def remedies(sight: Sight, trial: int) -> tuple[str, ...]:
+    """What would end each degenerate case that was recognised in one trial, in words."""
+    return tuple(_REMEDIES[flag] for flag in Degeneracy if flag and int(sight.degeneracy[trial]) & flag)
+
+
 def working_point(problem: Problem, R: Tensor, t: Tensor, settings: VerdictSettings) -> Float[Tensor, "b 3"]:
     """The given point; else the mean nominal shaft end or head point seen from the camera; else 100 mm along the
     shaft."""

@@ -95,6 +95,22 @@ class VerdictSettings:
 
 
 @dataclass(frozen=True, config=_STRICT)
+class AdviceSettings:
+    """Which further motions are proposed."""
+
+    motions: Annotated[int, Field(ge=0, le=20)] = 3
+    """Motions proposed, each chosen with the ones before it counted in; 0 for no advice."""
+    candidates: Count = 1024
+    """Random motions of several joints among which to choose, beside those of one and of two joints."""
+    reach_deg: Positive = 15.0
+    """Farthest that a revolute joint may go outside of the range that the recording shows; always within its limits."""
+    reach_mm: Positive = 30.0
+    """The same for a prismatic joint."""
+    nearest_mm: Positive = 25.0
+    """Motions that bring a visible part of the shaft nearer to a camera than this are not proposed."""
+
+
+@dataclass(frozen=True, config=_STRICT)
 class SolverSettings:
     """Everything the solver can be told."""
 
@@ -107,6 +123,8 @@ class SolverSettings:
     """Noise levels (`joint`)."""
     verdict: VerdictSettings = VerdictSettings()
     """Thresholds of the verdict."""
+    advice: AdviceSettings = AdviceSettings()
+    """Further motions that are proposed."""
     robust: Literal["auto", "on", "off"] = "auto"
     """Outlier rejection by graduated non-convexity: `auto` where the first fit shows measurements that noise does not
     explain."""

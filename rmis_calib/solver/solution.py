@@ -7,6 +7,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from rmis_calib.solver.normal import NoiseModel
+from rmis_calib.solver.residuals import State
+from rmis_calib.solver.unknowns import Layout
+
 
 class SolveStatus(IntEnum):
     """How a solve ended. `.sentence` says it in words."""
@@ -142,6 +146,23 @@ class Sight:
 
 
 @dataclass(frozen=True)
+class Posterior:
+    """The estimate of every unknown and what is known about it, flat over trials: what further motions add to.
+
+    Attributes:
+        state: the estimate.
+        layout: the unknowns, with their priors.
+        noise: variances, as large as the residuals say.
+        information: inverse covariance of the unknowns, priors included.
+    """
+
+    state: State
+    layout: Layout
+    noise: NoiseModel
+    information: Float[Tensor, "b p p"]
+
+
+@dataclass(frozen=True)
 class Solution:
     """Estimates for every trial of the batch.
 
@@ -164,6 +185,7 @@ class Solution:
         bias: correction that was subtracted from (rotation, translation); zero when none.
         sight: what the data can see, flat over trials (observability.py); `observability(trial)` puts one trial into
             words.
+        posterior: what further motions would add to (design.py); None for methods that estimate no noise.
         history: cost of accepted iterates of the refinement.
         information_kept: part of the information (per parameter, geometric mean) that thinning kept; 1 without.
     """
@@ -185,6 +207,7 @@ class Solution:
     nuisances: dict[str, Nuisance]
     bias: Float[Tensor, "*batch 6"]
     sight: Sight
+    posterior: Posterior | None = None
     history: tuple[Float[Tensor, "..."], ...] = ()
     information_kept: float = 1.0
 

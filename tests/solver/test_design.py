@@ -1,13 +1,11 @@
-"""Thinning and advice by information."""
-
-from dataclasses import replace
+"""Thinning by information."""
 
 import pytest
 import torch
 
 from rmis_calib.errors import InputError
 from rmis_calib.solver import MotionReason, SolverSettings, solve
-from rmis_calib.solver.design import advise, motion_information, thin
+from rmis_calib.solver.design import motion_information, thin
 from rmis_calib.solver.joint import solve_joint
 
 
@@ -58,26 +56,3 @@ def test_batches_cannot_be_thinned(simulate):
     problem, _, _ = simulate(trials=2)
     with pytest.raises(InputError, match="a single trial"):
         solve(problem, SolverSettings(thin_to=10))
-
-
-def test_advice_prefers_motions_that_shrink_the_error(static):
-    """Advised motions, actually added, leave the error that was promised; the best beats the median candidate."""
-    problem, _ = static
-    settings = SolverSettings(bias_correction=False, robust="off")
-    near = problem.select_motions(torch.arange(86, 130))  # a few motions in the middle of the range
-    fit = solve_joint(near, settings)
-    information = torch.linalg.inv(fit.covariance[0])
-    point = torch.tensor([0.0, 0.0, 100.0], dtype=torch.float64)
-    advice = advise(problem, fit.state, fit.layout, fit.noise, information, point, (0.8, 0.6), settings)
-    assert bool(advice.visible.any())
-    best, median = advice.sigma_mm[advice.order[0]], advice.sigma_mm[advice.visible].median()
-    assert float(best) < float(median) < advice.sigma_before_mm
-    chosen = advice.order[:1]
-    with_best = solve_joint(near.select_motions(torch.arange(44)), settings, fit)
-    more = replace(problem.select_motions(torch.cat((torch.arange(86, 130), chosen))))
-    added = solve_joint(more, settings, with_best)
-    from rmis_calib.solver.observability import carried
-
-    A = carried(added.state.t[0], point, 0.0)[3:]
-    sigma = float((A @ added.covariance[0, :6, :6] @ A.mT).trace().sqrt())
-    assert sigma == pytest.approx(float(best), rel=0.1)  # predicted at the estimate before

@@ -1,0 +1,177 @@
+"""Advice in words: within the joints' limits, in the field of view, and true when it is followed."""
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import data_synth
+import rmis_calib as rc
+from data_synth.scene import build_scene
+from data_synth.settings import SceneSettings
+from rmis_calib.config import parse_config
+from rmis_calib.pipeline.estimation import estimate, problem_of
+from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
+from rmis_calib.pipeline.next_motion import advice_record, camera_view, joint_box, joint_candidates, seen_view
+from rmis_calib.pipeline.poses import motion_poses
+
+SMALL = {"fx_px": 175.0, "fy_px": 175.0, "cx_px": 80.0, "cy_px": 60.0, "distortion": [0.0] * 5}
+SIGMA_PX = 0.2
+CONFIG = parse_config({"edge_bias_px": 0.0, "solver": {"bias_correction": False, "advice": {"candidates": 200}}})
+
+
+def written(path, laparoscope="static", motions=14):
+    """A recording of small motions with small pictures: only its truth is used."""
+    config = {
+        "motions": motions,
+        "seed": 3,
+        "camera": {"width_px": 160, "height_px": 120, "right": SMALL, "left": None},
+        "motion": {"laparoscope": laparoscope, "rotation_range_deg": 2.0, "translation_range_mm": 4.0},
+        "noise": {"kinematics_mm": 0.0, "kinematics_deg": 0.0},
+    }
+    data_synth.write_recording(path, data_synth.load_synth_config(config))
+    return path
+
+
+@pytest.fixture(scope="module")
+def weak(tmp_path_factory):
+    """Recording, its kinematics and what a detector would measure in it."""
+    path = written(tmp_path_factory.mktemp("weak") / "recording")
+    recording = rc.load_recording(path)
+    poses = motion_poses(recording)
+    return recording, KinematicUnknowns(recording, poses.frames, "cpu"), observations(path, recording, poses)
+
+
+def observations(path, recording, poses, kinds=("axis", "contour", "end")):
+    truth = np.load(path / "truth.npz")
+    generator = np.random.default_rng(0)
+    sigma = SIGMA_PX / float(recording.stereo.right.focal)
+    arrays = {f"{kind}_right": truth[f"right_{kind}_xy"][poses.frames] for kind in kinds}
+    return rc.ShaftObservations(
+        arm_T_rcm=poses.arm_T_rcm.numpy(),
+        rcm_v_axis=poses.rcm_v_axis.numpy(),
+        rcm_s_end_mm=poses.rcm_s_end_mm.numpy(),
+        shaft_radius_mm=recording.shaft_diameter_mm / 2,
+        sigma_image=sigma,
+        **{name: value + sigma * generator.standard_normal(value.shape) for name, value in arrays.items()},
+    )
+
+
+def advised(weak, config=CONFIG):
+    recording, unknowns, seen = weak
+    solution = estimate(seen, config)
+    problem = problem_of(seen, config)
+    used = np.ones(problem.n_motions, dtype=bool)
+    candidates = joint_candidates(recording, unknowns, problem, solution, used, config.solver.advice, seed=0)
+    view = camera_view(recording.stereo.right)[None]
+    return candidates, advice_record(solution, candidates, view, config, "within reach"), solution
+
+
+def test_motions_stay_within_reach_and_limits(weak):
+    recording, unknowns, _ = weak
+    logged = unknowns.readings_of_motions(0.0).numpy()
+    settings = CONFIG.solver.advice
+    low, high = joint_box(recording, unknowns.columns, logged, settings)
+    mm = np.array([column.endswith("_mm") for column in unknowns.columns])
+    reach = np.where(mm, 30.0, np.deg2rad(15.0))
+    np.testing.assert_allclose(low, logged.min(0) - reach)
+    np.testing.assert_allclose(high, logged.max(0) + reach)
+    name = unknowns.columns[-1]
+    limited = with_limits(recording, name, 150.0, 170.0)
+    low, high = joint_box(limited, unknowns.columns, logged, settings)
+    assert (low[-1], high[-1]) == (150.0, 170.0)
+    candidates, record, _ = advised((limited, *weak[1:]))
+    assert candidates.joints is not None
+    low, high = joint_box(limited, unknowns.columns, logged, settings)
+    assert bool(((candidates.joints >= low - 1e-9) & (candidates.joints <= high + 1e-9)).all())
+    assert all(150.0 <= motion["joints"][name] <= 170.0 for motion in record["next_motions"])
+
+
+def with_limits(recording, column, least, greatest):
+    """The recording with a robot whose joint has limits."""
+    arms = dict(recording.robot.arms)
+    arm = arms["instrument"]
+    joints = tuple(
+        replace(joint, min=least, max=greatest) if f"instrument.{joint.name}_{joint.unit}" == column else joint
+        for joint in arm.joints
+    )
+    robot = replace(recording.robot, arms=arms | {"instrument": replace(arm, joints=joints)})
+    return replace(recording, robot=robot)
+
+
+def test_readings_keep_the_shaft_in_the_true_camera(weak):
+    """The advised readings, put into the independent kinematics."""
+    _, record, _ = advised(weak)
+    scene = build_scene(SceneSettings())
+    for motion in record["next_motions"]:
+        readings = np.array(list(motion["joints"].values()))
+        shaft = scene.instrument.shaft(readings[3:])
+        base_T_camera = scene.laparoscope.tool(readings[:3]) @ np.linalg.inv(scene.camera_right_T_arm)
+        camera_T_rcm = np.linalg.inv(base_T_camera) @ shaft.base_T_rcm
+        s = np.linspace(0.0, shaft.rcm_s_end_mm + scene.shaft_end_offset_mm, 200)
+        q = camera_T_rcm[:3, 3] + s[:, None] * (camera_T_rcm[:3, :3] @ shaft.rcm_v_axis)
+        uv = q[:, :2] / q[:, 2:] * 175.0 + np.array([80.0, 60.0])
+        inside = (q[:, 2] > 0.0) & ((uv >= 0.0) & (uv <= np.array([159.0, 119.0]))).all(axis=1)
+        assert inside.mean() * s[-1] > 10.0
+
+
+def test_words_name_joints_readings_and_what_is_gained(weak):
+    candidates, record, solution = advised(weak)
+    first, motion = record["advice"][0], record["next_motions"][0]
+    assert solution.observability().directions[0][1] in first
+    assert candidates.joints is not None
+    index = candidates.words.index(motion["words"])
+    assert motion["words"] in first
+    assert list(motion["joints"].values()) == candidates.joints[index].tolist()
+    moves = re.findall(r"(laparoscope|instrument)\.(\w+) from (-?[\d.]+) to (-?[\d.]+) (deg|mm)", first)
+    assert moves
+    for arm, joint, _, after, unit in moves:
+        value = motion["joints"][f"{arm}.{joint}_{'mm' if unit == 'mm' else 'rad'}"]
+        assert float(after) == pytest.approx(value if unit == "mm" else np.rad2deg(value), abs=0.06)
+    sigmas = [motion["weakest_sigma_mm"] for motion in record["next_motions"]]
+    assert sigmas[0] < 0.5 * solution.observability().directions[0][0]
+    assert sigmas == sorted(sigmas, reverse=True)
+    json.dumps(record, allow_nan=False)
+
+
+def test_axis_lines_of_a_still_laparoscope_need_the_laparoscope_to_move(weak):
+    """Without a radius the instrument alone can never tell the translation along the view."""
+    config = parse_config({"measurements": ["axis"], "solver": {"advice": {"motions": 1}}})
+    _, record, solution = advised(weak, config)
+    assert "STATIC_LAPAROSCOPE" in solution.observability().degeneracies
+    assert all("laparoscope." in motion["words"] for motion in record["next_motions"])
+    assert "In general: move the laparoscope's arm as well, with its joints logged." in record["advice"]
+
+
+def test_an_observations_file_gets_advice_as_the_picture_shows_it(weak):
+    result = rc.solve(weak[2], CONFIG, throw=False)
+    advice = result.observability["advice"]
+    assert re.search(r"(swing|insert|withdraw|turn) the (instrument|laparoscope)", advice[0])
+    assert any("tells no joints" in sentence for sentence in advice)
+    assert all(motion["joints"] is None for motion in result.observability["next_motions"])
+    again = type(result).from_dict(json.loads(json.dumps(result.to_dict(), allow_nan=False)))
+    assert again.observability["advice"] == advice
+
+
+def test_no_advice_where_none_is_wanted_or_no_estimate_predicts(weak):
+    quiet = parse_config({"edge_bias_px": 0.0, "solver": {"advice": {"motions": 0}}})
+    assert "advice" not in rc.solve(weak[2], quiet, throw=False).observability
+    two_step = parse_config({"solver": {"method": "global"}})
+    assert "advice" not in rc.solve(weak[2], two_step, throw=False).observability
+
+
+def test_views_of_a_camera_and_of_measurements(weak):
+    camera = weak[0].stereo.right
+    x0, y0, x1, y1 = camera_view(camera).tolist()
+    # 5 per cent of 159 px and of 119 px on every side, over f = 175 px, about (80, 60).
+    np.testing.assert_allclose([x0, x1], [(0.05 * 159 - 80) / 175, (0.95 * 159 - 80) / 175])
+    np.testing.assert_allclose([y0, y1], [(0.05 * 119 - 60) / 175, (0.95 * 119 - 60) / 175])
+    barrel = replace(camera, distortion=torch.tensor([-0.3, 0.1, 0.0, 0.0, 0.0], dtype=torch.float64))
+    assert camera_view(barrel)[0] < x0  # a barrel picture shows more
+    problem = problem_of(weak[2], CONFIG).flatten_batch()
+    least, greatest = seen_view(problem)[0, :2], seen_view(problem)[0, 2:]
+    points = torch.as_tensor(weak[2].contour_right).flatten(0, 2)
+    assert bool((least <= points.amin(0)).all() & (greatest >= points.amax(0)).all())
