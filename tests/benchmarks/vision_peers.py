@@ -15,15 +15,21 @@ import numpy as np
 
 def best_threshold(image: np.ndarray) -> int:
     """The level below which the most shaft-like component appears: peers are spared the choice, and its time."""
-    return max(range(40, 140, 10), key=lambda level: dark_mask(image, level)[1])
+    level, seen = _darkness(image)
+    return max(range(40, 140, 10), key=lambda t: _best_component(((level <= t) & seen).astype(np.uint8))[1])
 
 
 def dark_mask(image: np.ndarray, threshold: int) -> tuple[np.ndarray, float]:
     """Mask of the most shaft-like component that is darker and greyer than a level, 0 or 255; how shaft-like it is."""
+    level, seen = _darkness(image)
+    return _best_component(((level <= threshold) & seen).astype(np.uint8))
+
+
+def _darkness(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The larger of brightness and saturation, smoothed; and where the picture is not black."""
     hsv = cv2.cvtColor(image, cv2.COLOR_RGB2HSV)
     level = cv2.GaussianBlur(cv2.max(hsv[..., 2], hsv[..., 1]), (5, 5), 0)
-    seen = cv2.erode((image.max(-1) > 9).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
-    return _best_component(((level <= threshold) & seen).astype(np.uint8))
+    return level, cv2.erode((image.max(-1) > 9).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
 
 
 def _best_component(mask: np.ndarray) -> tuple[np.ndarray, float]:
@@ -34,7 +40,8 @@ def _best_component(mask: np.ndarray) -> tuple[np.ndarray, float]:
     for i in range(1, count):
         if stats[i, cv2.CC_STAT_AREA] < 0.004 * mask.size:
             continue
-        points = np.argwhere(labels == i)[:, ::-1].astype(np.float32)
+        x, y, w, h = stats[i, :4]
+        points = np.argwhere(labels[y : y + h, x : x + w] == i)[:, ::-1].astype(np.float32)
         _, (w, h), _ = cv2.minAreaRect(points[:: max(1, len(points) // 2000)])
         long, short = max(w, h), max(min(w, h), 1.0)
         score = long * short**0.5 * (len(points) / max(w * h, 1.0)) ** 3 * min(long / short, 3.0)
