@@ -40,7 +40,8 @@ SLEEVE = Surface((0.27, 0.27, 0.275), 0.60, 26.0, "metal")
 CLEVIS = Surface((0.23, 0.23, 0.235), 0.75, 20.0, "clevis")
 STEEL = Surface((0.22, 0.22, 0.225), 0.55, 16.0, "metal")
 WHITE = Surface((0.70, 0.66, 0.58), 0.25, 10.0)
-SHAFTS = {"dark_grey": DARK_GREY, "carbon": CARBON, "anodised": ANODISED}
+SLATE = Surface((0.055, 0.059, 0.073), 0.03, 6.0)
+SHAFTS = {"dark_grey": DARK_GREY, "carbon": CARBON, "anodised": ANODISED, "slate": SLATE}
 
 
 @dataclass(frozen=True)

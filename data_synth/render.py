@@ -105,7 +105,7 @@ class Renderer:
             (self._swept(partial(self._other_poses, side, other), times), other_finish(other.kind))
             for other in world.props.others
         ]
-        instruments.append((self._swept(partial(self.own_poses, side, frames), times), own_finish(self.look)))
+        instruments.append((self.swept_poses(side, frames, times), own_finish(self.look)))
         picture = self._background(view, base_T_camera, light, [poses for poses, _ in instruments])
         if self._spread_s:
             picture = smear(picture, self._tissue_motion_px(view, times[:, rows // 2]))
@@ -157,7 +157,11 @@ class Renderer:
             gain = gain * (1.0 - self.look.shadow * dark)
         return shade(self.tissue, surface, gain, self.size, view.parity)
 
-    def own_poses(self, side: str, frames: Array, times: Array) -> InstrumentPoses:
+    def swept_poses(self, side: str, frames: Array, times: Array) -> InstrumentPoses:
+        """The logged instrument in a camera over the exposures about `times`; `frames` and `times` are (B, R)."""
+        return self._swept(partial(self._own_poses, side, frames), times)
+
+    def _own_poses(self, side: str, frames: Array, times: Array) -> InstrumentPoses:
         """The logged instrument in a camera; `frames` (B, R) and `times` (..., B, R)."""
         shaft, camera_T_rcm = self.world.shaft(side, frames, times)
         return self._poses(shaft, camera_T_rcm[..., :3, 0], self.look.wrist_radius_ratio)

@@ -100,8 +100,8 @@ class LookSettings:
     """Density of smoke."""
     shadow: Fraction = 0.5
     """Darkness of the instruments' shadows."""
-    shaft: Literal["dark_grey", "carbon", "anodised"] = "dark_grey"
-    """Surface of the shaft."""
+    shaft: Literal["dark_grey", "carbon", "anodised", "slate"] = "dark_grey"
+    """Surface of the shaft; `slate` is as bright as dark liver and differs from it by its colour."""
     glare: NonNegative = 1.0
     """Strength of the shaft's glare stripe; from about 15 it saturates."""
     wrist_radius_ratio: Annotated[float, Field(gt=0.3, le=1.0)] = 0.94

@@ -36,7 +36,7 @@ from rmis_calib.vision import ShaftDetections, ShaftDetector
 
 PRESETS = (
     "clean", "mild", "tissue", "smoke", "barrel", "davinci_720", "davinci_986", "davinci_sd", "two_instruments",
-    "glare", "carbon", "blood", "hard", "brutal", "absent",
+    "glare", "carbon", "blood", "cholec", "leaving", "hard", "brutal", "absent",
 )  # fmt: skip
 FOUND_PX, BATCH = 3.0, 8
 GOALS = {"clean": (0.05, 1.0), "brutal": (0.5, 0.9)}
