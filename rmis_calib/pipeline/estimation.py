@@ -103,6 +103,10 @@ def estimate_with_kinematics(
     if "joint_offset" not in solution.nuisances:
         return solution, ()
     held = solution.nuisances["joint_offset"].held
+    if bool(held.all()):
+        return solve_with(sigma * 0.0), (
+            _about_offsets(solution.nuisances["joint_offset"], held, unknowns.columns, 0.0),
+        )
     if bool(held.any()):
         solution = solve_with(torch.where(held, HELD * sigma, sigma))
     offsets = solution.nuisances["joint_offset"]
