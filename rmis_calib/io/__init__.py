@@ -19,7 +19,6 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "atomic_write": ".atomic",
         "config_names": ".configs",
         "config_path": ".configs",
-        "ensure_output_dir": ".atomic",
         "load_recording": ".recording",
         "load_robot": ".robot",
         "load_stereo": ".stereo",

@@ -75,22 +75,6 @@ def atomic_directory(path: str | Path, overwrite: bool = False) -> Iterator[Path
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def ensure_output_dir(path: str | Path) -> Path:
-    """The folder `path`, made if absent and known to be writable.
-
-    Raises:
-        OutputError: it is a file, or cannot be made or written to.
-    """
-    folder = Path(path)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise _output_error(folder, error) from error
-    return folder
-
-
 def write_json(path: str | Path, value: Any) -> None:
     """Write plain values as indented JSON, whole or not at all.
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from rmis_calib.errors import InputError, OutputError, VideoError
-from rmis_calib.io.atomic import atomic_directory, atomic_write, ensure_output_dir, write_json, write_yaml
+from rmis_calib.io.atomic import atomic_directory, atomic_write, write_json, write_yaml
 from rmis_calib.io.configs import load_yaml
 
 is_root = os.geteuid() == 0
@@ -71,19 +71,14 @@ def test_missing_folder_and_folder_as_file(tmp_path: Path) -> None:
         write_json(tmp_path / "none" / "a.json", {})
     with pytest.raises(OutputError, match="expected a file to write, found a folder"):
         write_json(tmp_path, {})
-    (tmp_path / "file").write_text("x")
-    with pytest.raises(OutputError, match="found File exists"):
-        ensure_output_dir(tmp_path / "file")
-    assert ensure_output_dir(tmp_path / "a" / "b").is_dir()
 
 
 @pytest.mark.skipif(is_root, reason="root writes everywhere")
 def test_unwritable_folder(tmp_path: Path) -> None:
     folder = tmp_path / "locked"
     folder.mkdir(mode=0o500)
-    for write in (lambda: ensure_output_dir(folder), lambda: write_json(folder / "a.json", {})):
-        with pytest.raises(OutputError, match="Permission denied"):
-            write()
+    with pytest.raises(OutputError, match="Permission denied"):
+        write_json(folder / "a.json", {})
     with pytest.raises(OutputError, match="Permission denied"), atomic_directory(folder / "out"):
         pass
 
@@ -91,7 +86,7 @@ def test_unwritable_folder(tmp_path: Path) -> None:
 def test_unwritable_place_for_root_too() -> None:
     # The kernel refuses new files here to everyone.
     with pytest.raises(OutputError, match="expected a writable place"):
-        ensure_output_dir("/proc/rmis_calib")
+        write_json("/proc/rmis_calib.json", {})
 
 
 def test_directory_appears_whole(tmp_path: Path) -> None:
