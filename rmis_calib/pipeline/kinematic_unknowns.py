@@ -132,16 +132,18 @@ class KinematicUnknowns:
 
     def _readings(self, clock_s: Float[Tensor, " b"]) -> tuple[Float[Tensor, "b m j"], Tensor]:
         """Readings at the frames' times, and where the log knows them; the nearest known time elsewhere."""
-        times = self._times + clock_s.cpu().numpy()[:, None]
+        times = self._times_at(clock_s)
         _, known = self._log.at(times.ravel())
-        values = [np.interp(times, self._log.timestamps_s, column) for column in self._log.values.T]
-        readings = torch.as_tensor(np.stack(values, axis=-1), device=self._device)
-        return readings, torch.as_tensor(known.reshape(times.shape), device=self._device)
+        readings, _ = self._log.interpolate(times)
+        known = known.reshape(times.shape)
+        return torch.as_tensor(readings, device=self._device), torch.as_tensor(known, device=self._device)
 
     def _velocity(self, clock_s: Float[Tensor, " b"]) -> Float[Tensor, "b m j"]:
-        """Central difference over one sample interval of the log to either side, unit per second."""
-        step_s = float(np.median(np.diff(self._log.timestamps_s)))
-        return (self._readings(clock_s + step_s)[0] - self._readings(clock_s - step_s)[0]) / (2.0 * step_s)
+        """Of the readings, unit per second."""
+        return torch.as_tensor(self._log.interpolate(self._times_at(clock_s))[1], device=self._device)
+
+    def _times_at(self, clock_s: Float[Tensor, " b"]) -> np.ndarray:
+        return self._times + clock_s.cpu().numpy()[:, None]
 
     def _derivative(self, readings: Float[Tensor, "b m j"]) -> Float[Tensor, "b m 6 j"]:
         """Displacement of the shaft as a rigid body, in `rcm`, per unit of each joint; all joints in one call."""

@@ -64,6 +64,19 @@ def test_log_of_one_sample() -> None:
     np.testing.assert_array_equal(values[1], [5.0, -2.0])
 
 
+def test_smooth_motion_and_its_velocity_between_samples() -> None:
+    """A sine of 1 Hz sampled at 25 Hz, unevenly: a straight line would be off by 2e-2 of its amplitude."""
+    stamps = np.arange(0.0, 2.0, 0.04) + np.random.default_rng(0).uniform(-0.01, 0.01, 50)
+    angle = 2.0 * np.pi * stamps
+    smooth = JointLog(stamps, ("a.x_rad", "a.y_mm"), np.stack([np.sin(angle), np.cos(angle)], axis=1))
+    times = np.linspace(0.1, 1.9, 501)
+    values, velocity = smooth.interpolate(times)
+    np.testing.assert_allclose(values[:, 0], np.sin(2.0 * np.pi * times), atol=1e-3)
+    np.testing.assert_allclose(velocity[:, 1], -2.0 * np.pi * np.sin(2.0 * np.pi * times), atol=0.1)
+    later, _ = smooth.interpolate(times + 1e-6)
+    np.testing.assert_allclose((later - values) / 1e-6, velocity, atol=1e-3)  # of the interpolant itself
+
+
 @given(st.lists(st.floats(-1.0, 3.0), min_size=1, max_size=20), st.integers(0, 100))
 def test_agrees_with_numpy_interp(times: list[float], seed: int) -> None:
     stamps = np.cumsum(np.random.default_rng(seed).uniform(0.005, 0.04, 60))
