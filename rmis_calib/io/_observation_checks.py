@@ -9,7 +9,7 @@ from rmis_calib.errors import ObservationsError
 from rmis_calib.io._checks import check_rigid
 from rmis_calib.io._schemas import METRES
 
-REQUIRED = ("arm_T_rcm", "rcm_v_axis", "axis_right")
+REQUIRED = ("arm_T_rcm", "rcm_v_axis")
 _SIDES = ("right", "left")
 _MEASURED = {"axis": (2, 2), "contour": (2, 2, 2), "end": (2,), "head": (2,)}
 _SIGMA = {"axis": (), "contour": (2,), "end": (), "head": ()}
@@ -48,7 +48,7 @@ def canonical(given: Arrays) -> Arrays:
         arrays["camera_left_T_camera_right"] = _extrinsics(given["camera_left_T_camera_right"])
     known = _finite(arrays["arm_T_rcm"]) & _finite(arrays["rcm_v_axis"])
     for side in _SIDES:
-        if any(f"{kind}_{side}" in arrays for kind in _MEASURED):
+        if side == "right" or any(f"{kind}_{side}" in arrays for kind in _MEASURED):
             valid = _flags(f"valid_{side}", given.get(f"valid_{side}"), n) & known
             arrays[f"valid_{side}"] = _mask_side(arrays, side, valid)
     _check_kinematics(arrays)
@@ -76,6 +76,9 @@ def _motions(given: Arrays) -> int:
 def _check_needs(given: Arrays) -> None:
     """An array that is of no use without another."""
     has_left = any(f"{kind}_left" in given for kind in _MEASURED)
+    if not has_left and not any(f"{kind}_right" in given for kind in _MEASURED):
+        expected = f"something measured in a picture: any of {', '.join(_MEASURED)}, with _right or _left"
+        raise ObservationsError(where="observations", expected=expected, found="none")
     for side in _SIDES:
         for kind in _MEASURED:
             if f"{kind}_{side}" in given and kind in _NEEDS:

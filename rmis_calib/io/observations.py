@@ -33,8 +33,9 @@ class ShaftObservations:
     """(N, 4, 4), mm."""
     rcm_v_axis: np.ndarray
     """(N, 3), unit, RCM towards tip."""
-    axis_right: np.ndarray
-    """(N, 2, 2): [point (RCM side first), xy] of the axis line."""
+    axis_right: np.ndarray | None = None
+    """(N, 2, 2): [point (RCM side first), xy] of the axis line. Of axis lines, contours, ends and head points any will
+    do, in one camera or two."""
     axis_left: np.ndarray | None = None
     """(N, 2, 2)."""
     camera_left_T_camera_right: np.ndarray | None = None

@@ -10,6 +10,7 @@ from torch import Tensor
 from rmis_calib.solver.initialise import contour_starts, find_candidates
 from rmis_calib.solver.measurements import Packed
 from rmis_calib.solver.normal import NoiseModel, camera_distance2
+from rmis_calib.solver.point_starts import point_starts
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.refine import levenberg_marquardt
 from rmis_calib.solver.residuals import State, predict_shaft
@@ -30,14 +31,22 @@ SURE_RAD = 0.02
 
 
 def cheirality(packed: Packed, state: State, used: Bool[Tensor, "c b n"]) -> Float[Tensor, " b"]:
-    """Part of the used lines with the visible shaft in front of the camera and running to the tip as in the picture."""
+    """Part of the used lines with the visible shaft in front of the camera and running to the tip as in the picture;
+    used head points, and ends where no line was measured, count when they are in front."""
     shaft = predict_shaft(packed, state)
     x0, y0 = packed.line_xy[:, 0]
     x1, y1 = packed.line_xy[:, 1]
     turn = (y0 - y1) * shaft.m[0] + (x1 - x0) * shaft.m[1] + (x0 * y1 - y0 * x1) * shaft.m[2]
     depth = (x0 + x1) * shaft.u[0] + (y0 + y1) * shaft.u[1] + 2.0 * shaft.u[2]
     ok = packed.line_ok[0] & used
-    return ((turn > 0) & (depth > 0) & ok).sum((0, 2)) / ok.sum((0, 2)).clamp_min(1)
+    kinds = [((turn > 0) & (depth > 0), ok)]
+    if packed.has_heads:
+        kinds.append((shaft.p[2] + shaft.head[2] > 0, packed.head_ok & used))
+    if packed.has_ends and not bool(packed.line_ok.any()):
+        s_end = packed.s_end + state.end_offset[:, None]
+        kinds.append((shaft.p[2] + s_end * shaft.d[2] > 0, packed.end_ok & used))
+    good = torch.stack([(front & ok).sum((0, 2)) for front, ok in kinds]).sum(0)
+    return good / torch.stack([ok.sum((0, 2)) for _, ok in kinds]).sum(0).clamp_min(1)
 
 
 def compete(
@@ -72,6 +81,9 @@ def compete(
     if packed.has_contours:
         R, t = contour_starts(sample, torch.nan_to_num(problem.radius_mm), reweightings=10)
         starts_R, starts_t = [*starts_R, R], [*starts_t, t]
+    if _points_matter(packed):
+        R, t = point_starts(sample, settings.grid, COMPETING_MINIMA, reweightings=4)
+        starts_R, starts_t = [*starts_R, R], [*starts_t, t]
     race = _race(problem, sample, torch.cat(starts_R, 1), torch.cat(starts_t, 1), assumed, free, settings, robust=True)
     return race.state, race.noise, True
 
@@ -98,7 +110,15 @@ def _starts(
     if packed.has_contours:
         more_R, more_t = contour_starts(packed, torch.nan_to_num(problem.radius_mm))
         R, t = torch.cat((R, more_R), dim=1), torch.cat((t, more_t), dim=1)
+    if _points_matter(packed):
+        more_R, more_t = point_starts(packed, settings.grid, COMPETING_MINIMA)
+        R, t = torch.cat((more_R, R), dim=1), torch.cat((more_t, t), dim=1)
     return R, t
+
+
+def _points_matter(packed: Packed) -> bool:
+    """Whether to start from points: head points always, the shaft's ends where contours do not tell their places."""
+    return packed.has_heads or (packed.has_ends and not packed.has_contours)
 
 
 def _race(

@@ -218,5 +218,7 @@ def _check_rows(packed: Packed) -> None:
     measured = packed.rows_ok.sum((0, 2))
     if bool((measured < 6).any()):
         raise InsufficientDataError(
-            where="measurements", expected="at least 6 measured rows (3 lines)", found=int(measured.min())
+            where="measurements",
+            expected="at least 6 measured rows (3 lines or head points)",
+            found=int(measured.min()),
         )

@@ -217,7 +217,7 @@ class _Reader:
         )
 
     def _seen(self, side: str) -> bool:
-        return any(self.arrays.get(f"{kind}_{side}") is not None for kind in ("axis", "contour", "head"))
+        return any(self.arrays.get(f"{kind}_{side}") is not None for kind in ("axis", "contour", "end", "head"))
 
     def tensor(self, key: str) -> Tensor:
         value = self.arrays.get(key)

@@ -252,10 +252,24 @@ def test_unknown_and_missing_keys(tmp_path: Path) -> None:
     with pytest.raises(ObservationsError, match=r"obs\.npz: key 'axis_rihgt': .*did you mean axis_right\?"):
         ShaftObservations.load(path)
     np.savez(path, rcm_v_axis=minimal()["rcm_v_axis"])
-    with pytest.raises(
-        ObservationsError, match=r"obs\.npz: observations: expected keys .*found no arm_T_rcm, axis_right"
-    ):
+    with pytest.raises(ObservationsError, match=r"obs\.npz: observations: expected keys .*found no arm_T_rcm"):
         ShaftObservations.load(path)
+
+
+@pytest.mark.parametrize("kind", ["axis", "contour", "end", "head"])
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_any_one_measurement_will_do(kind: str, side: str) -> None:
+    arrays = everything()
+    needs = ("arm_T_rcm", "rcm_v_axis", "camera_left_T_camera_right", "shaft_radius_mm", "rcm_s_end_mm", "rcm_p_head")
+    one = ShaftObservations(**{key: arrays[key] for key in (*needs, f"{kind}_{side}")})
+    assert one.has_left == (side == "left")
+    assert one.valid_right is not None and one.valid_right.any() == (side == "right")
+
+
+def test_nothing_measured_at_all_is_refused() -> None:
+    arrays = everything()
+    with pytest.raises(ObservationsError, match=r"something measured in a picture: any of axis, contour, end, head"):
+        ShaftObservations(arm_T_rcm=arrays["arm_T_rcm"], rcm_v_axis=arrays["rcm_v_axis"])
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.01, 0.5, 0.99])
