@@ -79,10 +79,18 @@ class InstrumentPoses:
 
     def unbind(self) -> tuple[InstrumentPoses, ...]:
         """The same for every index of a further leading axis."""
-        arrays = (self.p_axis, self.v_axis, self.side, self.s_end, self.s_head)
-        return tuple(
-            InstrumentPoses(*parts, radius=self.radius, wrist_ratio=self.wrist_ratio)
-            for parts in zip(*arrays, strict=True)
+        parts = zip(self.p_axis, self.v_axis, self.side, self.s_end, self.s_head, strict=True)
+        return tuple(replace(self, p_axis=p, v_axis=v, side=d, s_end=e, s_head=h) for p, v, d, e, h in parts)
+
+    def between(self, weights: Tensor) -> InstrumentPoses:
+        """Mixtures (B, R) of these poses (B, K) by weights (R, K): a motion so short that it is straight."""
+        return replace(
+            self,
+            p_axis=weights @ self.p_axis,
+            v_axis=weights @ self.v_axis,
+            side=weights @ self.side,
+            s_end=self.s_end @ weights.T,
+            s_head=self.s_head @ weights.T,
         )
 
     def cylinders(self, camera_p_light: Tensor) -> Cylinders:
@@ -134,10 +142,10 @@ def gather_pixels(brush: Brush, planes: Tensor, motion_px: Tensor | None = None)
         plane = planes[:, group, i, :, None].float()
         mask &= torch.addcmul(plane[:, :, 2] + plane[:, :, 0] * x, plane[:, :, 1], y) > -margin
     mask = mask.repeat_interleave(GATHER_PX, dim=2)[..., :width]
-    flat = mask.flatten().nonzero()[:, 0]
-    inside = flat % (height * width)
-    image = torch.div(flat, height * width, rounding_mode="floor")
-    pose = image * rows + group[torch.div(inside, width, rounding_mode="floor")]
+    image, row, column = mask.nonzero(as_tuple=True)
+    inside = row * width + column
+    flat = image * (height * width) + inside
+    pose = image * rows + group[row]
     return flat, Pixels(brush.rays.xy.flatten(0, 1)[inside], brush.rays.jacobian[inside], pose)
 
 

@@ -34,6 +34,10 @@ class LoopPoses:
         """The same for every index of a further leading axis."""
         return tuple(LoopPoses(a, b, self.radius) for a, b in zip(self.a, self.b, strict=True))
 
+    def between(self, weights: Tensor) -> LoopPoses:
+        """Mixtures (B, R) of these poses (B, K) by weights (R, K): a motion so short that it is straight."""
+        return LoopPoses(weights.float() @ self.a, weights.float() @ self.b, self.radius)
+
     def motion_px(self, focal_px: float) -> Tensor | None:
         """How far its middle moves in the picture over the exposure, 1 sigma, (B * R, 2)."""
         if self.sweep is None:

@@ -32,6 +32,7 @@ CAMERA_RIGHT_P_LIGHT = np.array([2.5, -4.5, -1.0])
 """End of the light guide, between and above the two lenses, mm."""
 OTHER_WRIST_RATIO = 0.9
 SMOKE_COLOUR = (0.74, 0.73, 0.76)
+READOUT_KNOTS = 9
 SMOKE_SPEED = np.array([0.11, -0.07])
 """Drift of the smoke, pictures a second."""
 
@@ -95,24 +96,25 @@ class Renderer:
     def _picture(self, frames: Array, times: Array, view: _View) -> Tensor:
         """Picture of one exposure, or with rows read one after the other."""
         world, side = self.world, view.side
-        rows = len(view.coarse_rays) if self.settings.readout_s else 1
-        offsets = self.settings.readout_s * ((np.arange(rows) + 0.5) / rows - 0.5)
-        times, frames = times[:, None] + offsets, np.broadcast_to(frames[:, None], (len(frames), rows))
-        base_T_camera = world.base_T_camera(side, times)  # (B, R, 4, 4)
+        offsets, weights = self._reading(len(view.coarse_rays))
+        middle, times = times, times[:, None] + offsets  # (B, K)
+        frames = np.broadcast_to(frames[:, None], times.shape)
+        base_T_camera = np.einsum("rk,bkij->brij", weights, world.base_T_camera(side, times))  # (B, R, 4, 4)
         light = self._tensor(transform_points(world.camera_T_camera_right(side), CAMERA_RIGHT_P_LIGHT), torch.float64)
         brush = Brush(view.rays, light, self.settings.blur_px, self.settings.gamma)
         instruments = [
-            (self._swept(partial(self._other_poses, side, other), times), other_finish(other.kind))
+            (self._swept(partial(self._other_poses, side, other), times, weights), other_finish(other.kind))
             for other in world.props.others
         ]
-        instruments.append((self.swept_poses(side, frames, times), own_finish(self.look)))
+        instruments.append((self.swept_poses(side, frames, times, weights), own_finish(self.look)))
         picture = self._background(view, base_T_camera, light, [poses for poses, _ in instruments])
         if self._spread_s:
-            picture = smear(picture, self._tissue_motion_px(view, times[:, rows // 2]))
+            picture = smear(picture, self._tissue_motion_px(view, middle))
         for poses, finish in instruments:
             draw_instrument(picture, brush, poses, finish)
         for loop in world.props.loops:
-            draw_loop(picture, brush, self._swept(partial(self._loop_poses, side, loop), times), self.tissue)
+            loop_poses = self._swept(partial(self._loop_poses, side, loop), times, weights)
+            draw_loop(picture, brush, loop_poses, self.tissue)
         if self.look.smoke:
             self._blow_smoke(picture, view, times[:, 0])
         return picture.mul_(view.passed)
@@ -122,12 +124,25 @@ class Renderer:
         """Standard deviation of the instants of an exposure about its middle."""
         return self.settings.exposure_s / np.sqrt(12.0)
 
-    def _swept(self, poses_at: Callable[[Array], _Swept], times: Array) -> _Swept:
-        """Poses in the middle of the exposure, with those one sigma earlier and later."""
+    def _reading(self, rows: int) -> tuple[Array, Array]:
+        """When poses are computed (K,), relative to the frame, and their weights (R, K) for the groups of rows.
+
+        Over a readout of some milliseconds motion is straight between nine instants to a thousandth of a pixel.
+        """
+        if not self.settings.readout_s:
+            return np.zeros(1), np.ones((1, 1))
+        at = (np.arange(rows) + 0.5) / rows - 0.5
+        knots = np.linspace(at[0], at[-1], READOUT_KNOTS)
+        weights = np.maximum(0.0, 1.0 - np.abs(at[:, None] - knots) / (knots[1] - knots[0]))
+        return self.settings.readout_s * knots, weights
+
+    def _swept(self, poses_at: Callable[[Array], _Swept], times: Array, weights: Array) -> _Swept:
+        """Poses in the middle of the exposure at groups of rows, with those one sigma earlier and later."""
+        mixture = self._tensor(weights, torch.float64)
         if not self._spread_s:
-            return poses_at(times)
+            return poses_at(times).between(mixture)
         early, middle, late = poses_at(times + self._spread_s * np.array([-1.0, 0.0, 1.0])[:, None, None]).unbind()
-        return replace(middle, sweep=(early, late))
+        return replace(middle.between(mixture), sweep=(early.between(mixture), late.between(mixture)))
 
     def _tissue_motion_px(self, view: _View, times: Array) -> Tensor:
         """How far the tissue moves in the middle of the picture over the exposure, 1 sigma, (B, 2); columns and rows of
@@ -157,9 +172,10 @@ class Renderer:
             gain = gain * (1.0 - self.look.shadow * dark)
         return shade(self.tissue, surface, gain, self.size, view.parity)
 
-    def swept_poses(self, side: str, frames: Array, times: Array) -> InstrumentPoses:
-        """The logged instrument in a camera over the exposures about `times`; `frames` and `times` are (B, R)."""
-        return self._swept(partial(self._own_poses, side, frames), times)
+    def swept_poses(self, side: str, frames: Array, times: Array, weights: Array) -> InstrumentPoses:
+        """The logged instrument in a camera over the exposures about `times`; `frames` and `times` are (B, K), mixed by
+        weights (R, K)."""
+        return self._swept(partial(self._own_poses, side, frames), times, weights)
 
     def _own_poses(self, side: str, frames: Array, times: Array) -> InstrumentPoses:
         """The logged instrument in a camera; `frames` (B, R) and `times` (..., B, R)."""

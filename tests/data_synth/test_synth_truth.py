@@ -79,7 +79,9 @@ def paint_alone(world: World, side: str, background: float, finish: Finish) -> n
     brush = Brush(renderer.views[side].rays, light, settings.blur_px, settings.gamma)
     picture = torch.full((n, settings.height_px, settings.width_px, 3), background)
     frames = np.arange(n)[:, None]
-    draw_instrument(picture, brush, renderer.swept_poses(side, frames, world.frame_times_s[:, None]), finish)
+    draw_instrument(
+        picture, brush, renderer.swept_poses(side, frames, world.frame_times_s[:, None], np.ones((1, 1))), finish
+    )
     return picture.mean(-1).numpy().astype(np.float64)
 
 
