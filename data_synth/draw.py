@@ -11,12 +11,14 @@ from data_synth.instruments import (
     Cylinders,
     Hit,
     Pixels,
+    dot,
     dot3,
     edge,
     hit_capsule,
     hit_cylinder,
     make_cylinders,
     smeared,
+    unit,
     unit3,
 )
 from data_synth.materials import Finish, Surface, light_cylinder
@@ -39,7 +41,7 @@ PENUMBRA_MM = 1.6
 
 @dataclass(frozen=True)
 class RayMap:
-    """What every pixel of a camera sees: rays (H, W, 2), their Jacobian (H * W, 4), and the mean focal length, px.
+    """What every pixel of a camera sees: rays (2, H, W), their Jacobian (4, H, W), and the mean focal length, px.
 
     `read_at` (H,) says when a row is read, 0 to 1 from the first to the last row of the whole picture; `longest_step`
     is the largest distance between rays of neighbours in a row.
@@ -53,9 +55,7 @@ class RayMap:
 
     def field(self, parity: int) -> RayMap:
         """Every second row, from row `parity` on."""
-        height, width = self.xy.shape[:2]
-        jacobian = self.jacobian.view(height, width, 4)[parity::2].reshape(-1, 4)
-        xy = self.xy[parity::2].contiguous()
+        xy, jacobian = (part[:, parity::2].contiguous() for part in (self.xy, self.jacobian))
         return RayMap(xy, jacobian, self.focal_px, self.read_at[parity::2], self.longest_step)
 
 
@@ -127,7 +127,7 @@ def gather_pixels(brush: Brush, planes: Tensor, motion_px: Tensor | None = None)
     The planes' (x, y) parts are unit: values are distances in normalised coordinates. `motion_px` (K, 2) over the
     exposure widens the margin.
     """
-    height, width = brush.rays.xy.shape[:2]
+    height, width = brush.rays.xy.shape[1:]
     batch, rows, count = planes.shape[:3]
     group = (brush.rays.read_at * rows).long().clamp(max=rows - 1)
     blur_px = brush.blur_px if motion_px is None else float(smeared(brush.blur_px, motion_px.norm(dim=-1)).max())
@@ -135,7 +135,7 @@ def gather_pixels(brush: Brush, planes: Tensor, motion_px: Tensor | None = None)
     # One pixel decides for its neighbours in the row; the margin holds for the furthest of them.
     blocks = -(-width // GATHER_PX)
     middle = (torch.arange(blocks, device=planes.device) * GATHER_PX + GATHER_PX // 2).clamp(max=width - 1)
-    x, y = brush.rays.xy[:, middle].unbind(-1)
+    x, y = brush.rays.xy[..., middle]
     margin += (GATHER_PX // 2) * brush.rays.longest_step
     mask = torch.ones((batch, height, blocks), dtype=torch.bool, device=planes.device)
     for i in range(count):
@@ -146,7 +146,7 @@ def gather_pixels(brush: Brush, planes: Tensor, motion_px: Tensor | None = None)
     inside = row * width + column
     flat = image * (height * width) + inside
     pose = image * rows + group[row]
-    return flat, Pixels(brush.rays.xy.flatten(0, 1)[inside], brush.rays.jacobian[inside], pose)
+    return flat, Pixels(brush.rays.xy.flatten(1)[:, inside], brush.rays.jacobian.flatten(1)[:, inside], pose)
 
 
 def _outline(poses: InstrumentPoses) -> Tensor:
@@ -185,7 +185,7 @@ def draw_instrument(picture: Tensor, brush: Brush, poses: InstrumentPoses, finis
     hit = hit_cylinder(pixels, cylinders, shaft.radius, brush.blur_px)
     # Wrist and jaws can only show where the shaft has ended or nearly so: a quarter of the pixels.
     tip = (hit.s > (shaft.s_to - COVERED_MM)[pixels.pose]).nonzero()[:, 0]
-    near = Pixels(pixels.xy[tip], pixels.jacobian[tip], pixels.pose[tip])
+    near = pixels.pick(tip)
     colour = values[flat]
     head = p + s_head[:, None] * v
     beyond = _jaws(colour[tip], brush, near, head, v, poses.side.flatten(0, 1), motion_px)
@@ -233,7 +233,7 @@ def _paint(
     before = edge((part.s_to[pixels.pose] - hit.s) / hit.s_per_px, blur)
     after = edge((hit.s - part.s_from[pixels.pose]) / hit.s_per_px, blur)
     cover = (hit.inside * before * after)[:, None]
-    return torch.lerp(colour, light_cylinder(hit, light[pixels.pose], part.surface, brush.gamma), cover)
+    return torch.lerp(colour, light_cylinder(hit, pixels.of_pose(light), part.surface, brush.gamma), cover)
 
 
 def _jaws(
@@ -252,7 +252,7 @@ def _jaws(
         inside, normal, point = hit_capsule(
             pixels, head.float(), tip.float(), JAW_RADIUS_MM, brush.blur_px, brush.rays.focal_px, motion_px
         )
-        facing = torch.clamp(dot3(normal, unit3(brush.camera_p_light.float() - point)), min=0.0)
+        facing = torch.clamp(dot(normal, unit(brush.camera_p_light.float()[:, None] - point)), min=0.0)
         linear = torch.clamp(0.04 + 0.30 * facing + 0.6 * facing**24, max=1.0)
         colour = torch.lerp(colour, (linear ** (1.0 / brush.gamma))[:, None].expand(-1, 3), inside[:, None])
     return colour

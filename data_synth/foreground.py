@@ -9,7 +9,7 @@ import torch.nn.functional as nnf
 from torch import Tensor
 
 from data_synth.draw import Brush, gather_pixels
-from data_synth.instruments import dot3, hit_capsule, unit3
+from data_synth.instruments import dot, hit_capsule, unit, unit3
 from data_synth.tissue import GLOSS_SHARPNESS, HALF_EXTENT_MM, Tissue, sample_texture
 
 REFERENCE_MM = 95.0
@@ -55,20 +55,20 @@ def draw_loop(picture: Tensor, brush: Brush, loop: LoopPoses, tissue: Tissue) ->
         return
     a, b = loop.a.flatten(0, 1).float(), loop.b.flatten(0, 1).float()
     inside, normal, point = hit_capsule(pixels, a, b, loop.radius, brush.blur_px, brush.rays.focal_px, motion_px)
-    along = dot3(point - a[pixels.pose], unit3(b - a)[pixels.pose])
-    across = loop.radius * torch.asin(torch.clamp(normal[:, 1], -1.0, 1.0))
+    along = dot(point - pixels.of_pose(a), pixels.of_pose(unit3(b - a)))
+    across = loop.radius * torch.asin(torch.clamp(normal[1], -1.0, 1.0))
     grid = torch.stack([along + 20.0, 1.3 * across - 35.0], dim=-1) / HALF_EXTENT_MM
     base = _sample_scattered(tissue.colour, grid)
     # The wet skin is not smooth: the slopes of the tissue's texture tilt the normal and break the highlight up.
-    slopes = _sample_scattered(tissue.shape, grid)
-    normal = unit3(normal + 0.6 * torch.cat([slopes[:, :2], torch.zeros_like(slopes[:, :1])], dim=-1))
-    to_light = brush.camera_p_light.float() - point
-    distance = torch.sqrt(dot3(to_light, to_light))
-    to_light = to_light / distance[:, None]
-    facing = torch.clamp(dot3(normal, to_light), min=0.0)
-    mirror = dot3(normal, unit3(to_light - unit3(point)))
+    slope_x, slope_y, gloss = _sample_scattered(tissue.shape, grid).unbind(-1)
+    normal = unit(torch.stack([normal[0] + 0.6 * slope_x, normal[1] + 0.6 * slope_y, normal[2]]))
+    to_light = brush.camera_p_light.float()[:, None] - point
+    distance = torch.sqrt(dot(to_light, to_light))
+    to_light = to_light / distance
+    facing = torch.clamp(dot(normal, to_light), min=0.0)
+    mirror = dot(normal, unit(to_light - unit(point)))
     gain = torch.clamp((REFERENCE_MM / distance) ** (2.0 / brush.gamma), max=1.3)
-    highlight = 0.7 * slopes[:, 2] * torch.exp(GLOSS_SHARPNESS * (mirror - 1.0))
+    highlight = 0.7 * gloss * torch.exp(GLOSS_SHARPNESS * (mirror - 1.0))
     colour = gain[:, None] * (base * torch.sqrt(0.1 + 0.9 * facing)[:, None] + highlight[:, None])
     values = picture.view(-1, 3)
     values[flat] = torch.lerp(values[flat], torch.clamp(colour, max=1.0), inside[:, None])

@@ -20,12 +20,23 @@ FACING_LIMIT = 0.35
 
 @dataclass(frozen=True)
 class Pixels:
-    """Gathered pixels, M of them: ray (M, 2) in normalised coordinates, its Jacobian (M, 4) by the pixel, and their
-    picture (M,)."""
+    """Gathered pixels, M of them: ray (2, M) in normalised coordinates, its Jacobian (4, M) by the pixel, and their
+    picture (M,).
+
+    Components come first here and in everything that is computed of gathered pixels: each is one run of memory.
+    """
 
     xy: Tensor
     jacobian: Tensor
     pose: Tensor
+
+    def pick(self, index: Tensor) -> Pixels:
+        """Some of them."""
+        return Pixels(self.xy[:, index], self.jacobian[:, index], self.pose[index])
+
+    def of_pose(self, values: Tensor) -> Tensor:
+        """Values (K, ...) of poses at the pixels, (..., M)."""
+        return values.movedim(0, -1).contiguous()[..., self.pose]
 
 
 @dataclass(frozen=True)
@@ -77,6 +88,16 @@ def unit3(a: Tensor) -> Tensor:
     return a * torch.rsqrt(dot3(a, a).clamp_min(1e-20))[..., None]
 
 
+def dot(a: Tensor, b: Tensor) -> Tensor:
+    """Scalar products (M,) of vectors (3, M)."""
+    return torch.addcmul(torch.addcmul(a[0] * b[0], a[1], b[1]), a[2], b[2])
+
+
+def unit(a: Tensor) -> Tensor:
+    """Vectors (3, M) of unit length."""
+    return a * torch.rsqrt(dot(a, a).clamp_min(1e-20))
+
+
 def edge(signed_px: Tensor, blur_px: float | Tensor) -> Tensor:
     """Coverage of a half-plane whose border is `signed_px` away (positive: inside), seen through the point spread."""
     return 0.5 + 0.5 * torch.erf(signed_px * (0.7071067811865476 / blur_px))
@@ -89,9 +110,9 @@ def smeared(blur_px: float, shift_px: Tensor) -> Tensor:
 
 def _slope_px(gradient_x: Tensor, gradient_y: Tensor, jacobian: Tensor) -> Tensor:
     """Length of the gradient by the pixel, from that by the ray."""
-    gu = gradient_x * jacobian[:, 0] + gradient_y * jacobian[:, 2]
-    gv = gradient_x * jacobian[:, 1] + gradient_y * jacobian[:, 3]
-    return torch.sqrt(gu * gu + gv * gv).clamp_min(1e-12)
+    gu = torch.addcmul(gradient_x * jacobian[0], gradient_y, jacobian[2])
+    gv = torch.addcmul(gradient_x * jacobian[1], gradient_y, jacobian[3])
+    return torch.hypot(gu, gv).clamp_min(1e-12)
 
 
 @dataclass(frozen=True)
@@ -102,8 +123,8 @@ class Hit:
         s: axis coordinate, mm.
         s_per_px: its change across the picture, mm per px.
         inside: coverage by the two contours.
-        normal: (M, 2) unit normal along u and w.
-        point: (M, 3) in the cylinder's frame.
+        normal: (2, M) unit normal along u and w.
+        point: (3, M) in the cylinder's frame.
         depth: distance along the optical axis, mm.
     """
 
@@ -117,10 +138,10 @@ class Hit:
 
 def hit_cylinder(pixels: Pixels, cylinders: Cylinders, radius: float, blur_px: float) -> Hit:
     """Meet the rays of the pixels with the cylinders of their poses."""
-    frame = cylinders.frame[pixels.pose]  # (M, 3, 3)
+    frame = pixels.of_pose(cylinders.frame)  # (3, 3, M)
     distance = cylinders.distance[pixels.pose]
-    x, y = pixels.xy[:, 0], pixels.xy[:, 1]
-    du, dw, dv = (frame[:, i, 0] * x + frame[:, i, 1] * y + frame[:, i, 2] for i in range(3))
+    x, y = pixels.xy
+    du, dw, dv = (torch.addcmul(torch.addcmul(row[2], row[0], x), row[1], y) for row in frame)
     across = du * du + dw * dw
     # |d_perp|^2 r^2 - (dw D)^2: the discriminant without the cancellation of the textbook form.
     root = torch.sqrt(torch.clamp(across * radius**2 - (dw * distance) ** 2, min=0.0))
@@ -133,13 +154,13 @@ def hit_cylinder(pixels: Pixels, cylinders: Cylinders, radius: float, blur_px: f
     # on.
     facing = torch.clamp(nu * du + nw * dw, max=-FACING_LIMIT)
     slide = -dv / facing  # implicit derivative of the hit along the surface
-    gx, gy = (t * (slide * (nu * frame[:, 0, i] + nw * frame[:, 1, i]) + frame[:, 2, i]) for i in range(2))
+    gx, gy = (t * (slide * (nu * frame[0, i] + nw * frame[1, i]) + frame[2, i]) for i in range(2))
     inside = _between_contours(pixels, cylinders, radius, blur_px)
     in_front = (t > 0).float()
     depth = t
-    point = torch.stack([t * du, t * dw, t * dv], dim=-1)
+    point = torch.stack([t * du, t * dw, t * dv])
     inside = torch.clamp(inside, min=0.0) * in_front
-    return Hit(s, _slope_px(gx, gy, pixels.jacobian), inside, torch.stack([nu, nw], dim=-1), point, depth)
+    return Hit(s, _slope_px(gx, gy, pixels.jacobian), inside, torch.stack([nu, nw]), point, depth)
 
 
 def _between_contours(pixels: Pixels, cylinders: Cylinders, radius: float, blur_px: float) -> Tensor:
@@ -158,8 +179,9 @@ def _between_contours(pixels: Pixels, cylinders: Cylinders, radius: float, blur_
 
 def _plane_at(pixels: Pixels, plane: Tensor) -> tuple[Tensor, Tensor]:
     """Values (M,) of planes (K, 3) on the rays, and how much they change by the pixel."""
-    nx, ny, nz = plane.T.contiguous()[:, pixels.pose]
-    return nx * pixels.xy[:, 0] + ny * pixels.xy[:, 1] + nz, _slope_px(nx, ny, pixels.jacobian)
+    nx, ny, nz = pixels.of_pose(plane)
+    value = torch.addcmul(torch.addcmul(nz, nx, pixels.xy[0]), ny, pixels.xy[1])
+    return value, _slope_px(nx, ny, pixels.jacobian)
 
 
 def hit_capsule(
@@ -171,24 +193,24 @@ def hit_capsule(
     focal_px: float,
     motion_px: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Coverage (M,), unit normal (M, 3) and point (M, 3) of round-ended rods from a to b (K, 3), in camera coordinates.
+    """Coverage (M,), unit normal (3, M) and point (3, M) of round-ended rods from a to b (K, 3), in camera coordinates.
 
     The outline of a sphere-swept segment is where the ray comes as near to the segment as the radius: exact.
     `motion_px` (K, 2) is how far the rods move in the picture over the exposure, 1 sigma.
     """
-    a, e = a[pixels.pose], (b - a)[pixels.pose]
-    d = unit3(torch.cat([pixels.xy, torch.ones_like(pixels.xy[:, :1])], dim=-1))
-    de, da, ea, ee = dot3(d, e), dot3(d, a), dot3(e, a), dot3(e, e)
+    a, e = pixels.of_pose(a), pixels.of_pose(b - a)
+    d = unit(torch.cat([pixels.xy, torch.ones_like(pixels.xy[:1])]))
+    de, da, ea, ee = dot(d, e), dot(d, a), dot(e, a), dot(e, e)
     h = torch.clamp((da * de - ea) / (ee - de * de).clamp_min(1e-6), 0.0, 1.0)
-    nearest = a + h[:, None] * e
-    along = dot3(d, nearest)
-    offset = along[:, None] * d - nearest  # from the segment to the ray
-    gap = torch.sqrt(dot3(offset, offset))
+    nearest = torch.addcmul(a, h, e)
+    along = dot(d, nearest)
+    offset = along * d - nearest  # from the segment to the ray
+    gap = torch.sqrt(dot(offset, offset))
     lift = torch.sqrt(torch.clamp(1.0 - (gap / radius) ** 2, min=0.0))
-    normal = offset / gap.clamp_min(radius)[:, None] - lift[:, None] * d
+    normal = offset / gap.clamp_min(radius) - lift * d
     blur = blur_px
     if motion_px is not None:
-        motion = motion_px[pixels.pose]
-        blur = smeared(blur_px, normal[:, 0] * motion[:, 0] + normal[:, 1] * motion[:, 1])
+        motion = pixels.of_pose(motion_px)
+        blur = smeared(blur_px, normal[0] * motion[0] + normal[1] * motion[1])
     inside = edge((radius - gap) / along.clamp_min(1.0) * focal_px, blur)
     return inside, normal, nearest + radius * normal

@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from data_synth.instruments import Hit, dot3, unit3
+from data_synth.instruments import Hit, dot, unit
 from data_synth.settings_picture import LookSettings
 
 REFERENCE_MM = 100.0
@@ -70,17 +70,17 @@ def other_finish(kind: str) -> Finish:
 
 
 def light_cylinder(hit: Hit, light: Tensor, surface: Surface, gamma: float) -> Tensor:
-    """Encoded colour (M, 3) of the hit points under a point light (M, 3), both in the cylinder's frame."""
+    """Encoded colour (M, 3) of the hit points under a point light (3, M), both in the cylinder's frame."""
     to_light = light - hit.point
-    distance = torch.sqrt(dot3(to_light, to_light))
-    to_light = to_light / distance[:, None]
-    half = unit3(to_light - unit3(hit.point))
-    nu, nw = hit.normal[:, 0], hit.normal[:, 1]
-    diffuse = torch.clamp(nu * to_light[:, 0] + nw * to_light[:, 1], min=0.0)
+    distance = torch.sqrt(dot(to_light, to_light))
+    to_light = to_light / distance
+    half = unit(to_light - unit(hit.point))
+    nu, nw = hit.normal
+    diffuse = torch.clamp(nu * to_light[0] + nw * to_light[1], min=0.0)
     # A turned tube has fine grooves round it: they spread the highlight along the axis, so only the angle round it
     # counts.
-    across = torch.sqrt(half[:, 0] ** 2 + half[:, 1] ** 2).clamp_min(1e-3)
-    mirror = torch.clamp((nu * half[:, 0] + nw * half[:, 1]) / across, min=0.0)
+    across = torch.hypot(half[0], half[1]).clamp_min(1e-3)
+    mirror = torch.clamp((nu * half[0] + nw * half[1]) / across, min=0.0)
     highlight = surface.highlight * across * mirror**surface.sharpness
     reflectance = torch.tensor(surface.reflectance, device=diffuse.device).expand(len(diffuse), 3)
     # The square of the cosine fades in proportion to the distance from the limb; the cosine itself would fade like its
@@ -103,7 +103,7 @@ def light_cylinder(hit: Hit, light: Tensor, surface: Surface, gamma: float) -> T
 
 def _pattern(hit: Hit, pattern: str) -> Tensor:
     """Brightness factor (M,) of the surface's pattern, from axis coordinate and angle."""
-    angle = torch.atan2(hit.normal[:, 1], -hit.normal[:, 0])
+    angle = torch.atan2(hit.normal[1], -hit.normal[0])
     if pattern == "carbon":
         arc = 4.0 * angle
         return 1.0 + 0.28 * torch.sin(torch.pi * (hit.s + arc) / WEAVE_MM) * torch.sin(
@@ -116,7 +116,7 @@ def _pattern(hit: Hit, pattern: str) -> Tensor:
 
 def _blood_film(hit: Hit, share: float) -> Tensor:
     """Soft mask (M,) of patches on the surface: a sum of waves in axis coordinate and angle above a threshold."""
-    angle = torch.atan2(hit.normal[:, 1], -hit.normal[:, 0])
+    angle = torch.atan2(hit.normal[1], -hit.normal[0])
     waves = torch.sin(0.31 * hit.s + 1.3 * angle) + torch.sin(0.53 * hit.s - 2.1 * angle + 1.0)
     waves = waves + 0.6 * torch.sin(1.3 * hit.s + 3.0 * angle + 2.0)
     level = 2.0 - 3.2 * share

@@ -213,7 +213,7 @@ class Renderer:
         picture.lerp_(torch.tensor(SMOKE_COLOUR, device=self.device), self.look.smoke * density)
 
     def _tensor(self, values: Array, dtype: torch.dtype = torch.float32) -> Tensor:
-        return torch.as_tensor(np.array(values), dtype=dtype, device=self.device)
+        return torch.as_tensor(np.array(values, order="C"), dtype=dtype, device=self.device)
 
     def _view(self, side: str, camera: Camera) -> _View:
         v, u = np.meshgrid(np.arange(camera.height), np.arange(camera.width), indexing="ij")
@@ -221,8 +221,8 @@ class Renderer:
         coarse_xy, _ = camera.rays(coarse_nodes(camera.width, camera.height))
         coarse_rays = np.concatenate([coarse_xy, np.ones((*coarse_xy.shape[:2], 1))], axis=-1)
         rays = RayMap(
-            self._tensor(xy),
-            self._tensor(jacobian.reshape(-1, 4)),
+            self._tensor(np.moveaxis(xy, -1, 0)),
+            self._tensor(np.moveaxis(jacobian.reshape(*xy.shape[:2], 4), -1, 0)),
             0.5 * (camera.fx + camera.fy),
             self._tensor(np.arange(camera.height) / camera.height, torch.float64),
             float(np.linalg.norm(jacobian[..., 0], axis=-1).max()),

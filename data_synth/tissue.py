@@ -150,7 +150,7 @@ def _shade_strip(tissue: Tissue, fine: Tensor, out: Tensor) -> None:
     """Shade pixels `out` (B, h, W, 3) from texture position, light, half vector and gain: `fine` (B, 9, h, W)."""
     grid = fine[:, :2].movedim(1, -1)
     colour, shape = sample_texture(tissue.colour, grid), sample_texture(tissue.shape, grid)
-    slope_x, slope_y, gloss = shape.unbind(-1)
+    slope_x, slope_y, gloss = shape.movedim(-1, 0).contiguous()
     normal_z = torch.rsqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
     facing = (fine[:, 4] - slope_x * fine[:, 2] - slope_y * fine[:, 3]) * normal_z
     mirror = (fine[:, 7] - slope_x * fine[:, 5] - slope_y * fine[:, 6]) * normal_z
