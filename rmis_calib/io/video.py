@@ -1,7 +1,7 @@
 """Frames of a video or a folder of images: decoded ahead in a background thread, in bounded memory, onto a device."""
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
@@ -55,7 +55,7 @@ class FrameSource:
     def __repr__(self) -> str:
         return f"FrameSource({str(self.path)!r}, {self.count} frames of {self.size[1]} x {self.size[0]} px)"
 
-    def batches(self, batch_size: int, device: torch.device | str = "cpu") -> Iterator[FrameBatch]:
+    def batches(self, batch_size: int, device: torch.device | str = "cpu") -> Generator[FrameBatch, None, None]:
         """All frames in order, the last batch shorter where it must be.
 
         A thread decodes ahead; memory holds three batches at most, the consumer's among them. Closing the iterator, or
@@ -69,7 +69,7 @@ class FrameSource:
             raise InputError(where="batch_size", expected="at least 1", found=batch_size)
         return self._batches(batch_size, torch.device(device))
 
-    def _batches(self, batch_size: int, device: torch.device) -> Iterator[FrameBatch]:
+    def _batches(self, batch_size: int, device: torch.device) -> Generator[FrameBatch, None, None]:
         frames = self._reader.read_all()
         # An interrupt may hit between the start of the thread and its registration, and then `shutdown` does not wait.
         decoding = Lock()

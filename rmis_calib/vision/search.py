@@ -92,7 +92,7 @@ def _lay_out(
     canvas: Canvas, small: Float[Tensor, "b 3 h w"], field: Bool[Tensor, "b h w"], within: Bool[Tensor, "b h w"]
 ) -> tuple[Float[Tensor, "b 3 h2 w2"], Bool[Tensor, "b h2 w2"], Bool[Tensor, "b h2 w2"]]:
     """The shrunken picture, its field of view and the inner part of that, in ideal pixels."""
-    if canvas.grid is None:
+    if canvas.covered is None:
         return small, field, within
     stack = canvas.lay_out(torch.cat([small, field[:, None].to(small.dtype), within[:, None].to(small.dtype)], 1))
     return stack[:, :3], (stack[:, 3] > 0.5) & canvas.covered, (stack[:, 4] > 0.99) & canvas.covered
