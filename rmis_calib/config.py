@@ -27,6 +27,8 @@ class CalibrationConfig:
     """Where images and estimation live: `cpu`, `cuda` or `cuda:N`."""
     batch_size: int = 8
     """Frames decoded, moved and detected together."""
+    every: int = 1
+    """Only every n-th frame is searched: of a slow video, five neighbours say little more than one."""
     masks: str | None = None
     """Masks of one's own in place of the search by colour: a folder of pictures in the order of the frames, white on
     shafts (for stereo two folders below it, `right` and `left`), or a TorchScript (.pt) or ONNX (.onnx) model from
@@ -59,7 +61,7 @@ class CalibrationConfig:
             raise ValueError("a device is cpu, cuda or cuda:N")
         return value
 
-    @field_validator("batch_size", "min_motions")
+    @field_validator("batch_size", "every", "min_motions")
     @classmethod
     def _positive(cls, value: int) -> int:
         if value < 1:

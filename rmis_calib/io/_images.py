@@ -34,9 +34,9 @@ class ImageReader:
         height, width, _ = self._decode(self._files[0]).shape
         self.size: tuple[int, int] = (height, width)
 
-    def read_all(self) -> Generator[np.ndarray, None, None]:
-        """Every frame, (H, W, 3) uint8 RGB."""
-        yield from self.read(range(self.count))
+    def read_all(self, every: int = 1) -> Generator[np.ndarray, None, None]:
+        """Every n-th frame from the first, (H, W, 3) uint8 RGB."""
+        yield from self.read(range(0, self.count, every))
 
     def read(self, indices: Sequence[int]) -> Iterator[np.ndarray]:
         """Some frames, in the order asked for."""

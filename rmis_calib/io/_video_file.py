@@ -72,15 +72,16 @@ class VideoReader:
     def _has_pts(self) -> bool:
         return len(set(self._pts)) == self.count
 
-    def read_all(self) -> Generator[np.ndarray, None, None]:
-        """Every frame, (H, W, 3) uint8 RGB.
+    def read_all(self, every: int = 1) -> Generator[np.ndarray, None, None]:
+        """Every n-th frame from the first, (H, W, 3) uint8 RGB. All are decoded, but only those turned into RGB.
 
         Raises:
             VideoError: a frame cannot be decoded, or their number is not the one counted at opening.
         """
         number = 0
         for frame in self._decode():
-            yield self._pixels(frame, number)
+            if number % every == 0:
+                yield self._pixels(frame, number)
             number += 1
         if number != self.count:
             raise self._truncated(self.count, number)

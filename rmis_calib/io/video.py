@@ -23,7 +23,7 @@ _BATCHES_AHEAD = 2
 
 @dataclass(frozen=True, eq=False)
 class FrameBatch:
-    """Consecutive frames on one device."""
+    """Frames in order on one device, consecutive unless only every n-th was asked for."""
 
     indices: Int64[Tensor, " batch"]
     """Frame numbers, on the CPU."""
@@ -55,22 +55,26 @@ class FrameSource:
     def __repr__(self) -> str:
         return f"FrameSource({str(self.path)!r}, {self.count} frames of {self.size[1]} x {self.size[0]} px)"
 
-    def batches(self, batch_size: int, device: torch.device | str = "cpu") -> Generator[FrameBatch, None, None]:
-        """All frames in order, the last batch shorter where it must be.
+    def batches(
+        self, batch_size: int, device: torch.device | str = "cpu", every: int = 1
+    ) -> Generator[FrameBatch, None, None]:
+        """All frames in order, or every n-th from the first; the last batch shorter where it must be.
 
         A thread decodes ahead; memory holds three batches at most, the consumer's among them. Closing the iterator, or
         leaving its loop, ends the thread.
 
         Raises:
-            InputError: `batch_size` is not positive.
+            InputError: `batch_size` or `every` is not positive.
             VideoError: a frame cannot be decoded; raised when the consumer reaches its batch.
         """
         if batch_size < 1:
             raise InputError(where="batch_size", expected="at least 1", found=batch_size)
-        return self._batches(batch_size, torch.device(device))
+        if every < 1:
+            raise InputError(where="every", expected="at least 1", found=every)
+        return self._batches(batch_size, torch.device(device), every)
 
-    def _batches(self, batch_size: int, device: torch.device) -> Generator[FrameBatch, None, None]:
-        frames = self._reader.read_all()
+    def _batches(self, batch_size: int, device: torch.device, every: int) -> Generator[FrameBatch, None, None]:
+        frames = self._reader.read_all(every)
         # An interrupt may hit between the start of the thread and its registration, and then `shutdown` does not wait.
         decoding = Lock()
         executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="rmis-decode")
@@ -80,7 +84,7 @@ class FrameSource:
             start = 0
             while (images := ahead.popleft().result()) is not None:
                 ahead.append(executor.submit(_stack, frames, batch_size, decoding))
-                yield _to_device(images, start, device)
+                yield _to_device(images, torch.arange(start, start + len(images)) * every, device)
                 start += len(images)
         finally:
             executor.shutdown(wait=True, cancel_futures=True)
@@ -135,10 +139,9 @@ def _stack(frames: Iterator[np.ndarray], batch_size: int, decoding: Lock) -> np.
     return np.stack(batch) if batch else None
 
 
-def _to_device(images: np.ndarray, start: int, device: torch.device) -> FrameBatch:
+def _to_device(images: np.ndarray, indices: Int64[Tensor, " batch"], device: torch.device) -> FrameBatch:
     pixels = torch.from_numpy(images)
     if device.type == "cuda":
         # From pinned memory the copy runs beside the kernels of the batch before.
         pixels = pixels.pin_memory().to(device, non_blocking=True)
-    indices = torch.arange(start, start + len(images))
     return FrameBatch(indices, pixels.to(device).permute(0, 3, 1, 2))

@@ -92,7 +92,8 @@ class DetectionTable:
         for view in self.views:
             found = view.found
             name = "pictures" if view.camera is None else f"camera_{view.side}"
-            rows.append((name, f"{int(found.sum())} of {len(found)} frames with a shaft"))
+            searched = int((view.detections.reason != FrameReason.LEFT_OUT).sum())
+            rows.append((name, f"{int(found.sum())} of {searched} frames with a shaft"))
             ends = (view.detections.end_valid & view.detections.valid).any(dim=-1)
             rows.append(("  shaft end seen", f"{int(ends.sum())}"))
             codes, counts = view.detections.reason[~found].unique(return_counts=True)
@@ -172,8 +173,9 @@ def _detect_views(
     """All cameras at once: their videos are decoded side by side, and the next batches while the last are searched."""
     parts: dict[str, list[ShaftDetections]] = {camera.side: [] for camera in cameras}
     done = dict.fromkeys(parts, 0)
+    wanted = {camera.side: -(-camera.source.count // config.every) for camera in cameras}
     for camera in cameras:
-        progress(camera.stage, 0, camera.source.count)
+        progress(camera.stage, 0, wanted[camera.side])
     with ExitStack() as stack:
         executor, at_once = stack.enter_context(_workers(config.device))
         running: deque[tuple[_Camera, ShaftDetector, FrameBatch, Tensor | None, Future[ShaftDetections]]] = deque()
@@ -184,7 +186,7 @@ def _detect_views(
             parts[camera.side].append(found)
             watch(DetectedBatch(camera.side, camera.source, camera.times_s, detector, batch, masks, found))
             done[camera.side] += len(batch.indices)
-            progress(camera.stage, done[camera.side], camera.source.count)
+            progress(camera.stage, done[camera.side], wanted[camera.side])
 
         for camera, detector, batch in _take_turns(cameras, config, stack):
             masks = None if camera.masks is None else camera.masks(batch)
@@ -193,7 +195,8 @@ def _detect_views(
                 finish_one()
         while running:
             finish_one()
-    return tuple(View(c.side, c.source, c.camera, concatenate(parts[c.side])) for c in cameras)
+    found = {c.side: _over_all(concatenate(parts[c.side]), c.source.count, config.every) for c in cameras}
+    return tuple(View(c.side, c.source, c.camera, found[c.side]) for c in cameras)
 
 
 def _take_turns(
@@ -202,7 +205,7 @@ def _take_turns(
     """A batch of each camera in turn until all are through; leaving the stack ends their decoding."""
     left = deque()
     for camera in cameras:
-        batches = camera.source.batches(config.batch_size, config.device)
+        batches = camera.source.batches(config.batch_size, config.device, config.every)
         stack.callback(batches.close)
         moved = None if camera.camera is None else camera.camera.to(dtype=torch.float64, device=config.device)
         left.append((camera, ShaftDetector(config.detector, moved), batches))
@@ -236,3 +239,15 @@ def concatenate(parts: list[ShaftDetections]) -> ShaftDetections:
     """Batches of detections, one after the other."""
     joined = {f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(ShaftDetections)}
     return ShaftDetections(**joined)
+
+
+def _over_all(found: ShaftDetections, count: int, every: int) -> ShaftDetections:
+    """Detections of every n-th frame, as those of all `count` frames."""
+    if every == 1:
+        return found
+    spread = {}
+    for name, value in vars(found).items():
+        empty = torch.nan if value.is_floating_point() else int(FrameReason.LEFT_OUT) if name == "reason" else False
+        spread[name] = value.new_full((count, *value.shape[1:]), empty)
+        spread[name][::every] = value
+    return ShaftDetections(**spread)

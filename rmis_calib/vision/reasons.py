@@ -14,6 +14,7 @@ class FrameReason(IntEnum):
     TOO_SHORT = 5
     EDGES_UNCLEAR = 6
     AMBIGUOUS = 7
+    LEFT_OUT = 8
 
     @property
     def sentence(self) -> str:
@@ -30,4 +31,5 @@ _SENTENCES = {
     FrameReason.TOO_SHORT: "what looks like a shaft is too short, or never reaches the border of the picture",
     FrameReason.EDGES_UNCLEAR: "too few sub-pixel edge points agree on two straight lines",
     FrameReason.AMBIGUOUS: "a strip was found, but its confidence is below the accepted minimum",
+    FrameReason.LEFT_OUT: "the frame was left out: only every n-th was to be searched",
 }

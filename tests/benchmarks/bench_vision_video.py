@@ -1,6 +1,6 @@
 """Whole stereo video to lines, beside decoding alone: frames a second, their ratio, and peak memory over the length.
 
-    python tests/benchmarks/bench_vision_video.py [--frames 1000 10000] [--preset mild] [--every 1]
+    python tests/benchmarks/bench_vision_video.py [--frames 1000 10000] [--preset mild] [--every 1 4]
 
 A rendered smooth stereo video is repeated packet by packet to the length asked for (so there is a cut every 60 pairs).
 Each row is a process of its own; a frame is one picture, so a stereo pair counts twice. Decoding alone reads both
@@ -81,7 +81,7 @@ def run_one(task: str, path: Path) -> None:
     if task == "decode":
         count = decode(path)
     else:
-        table = detect(path, CalibrationConfig())
+        table = detect(path, CalibrationConfig(every=int(task)))
         count = sum(len(view.found) for view in table.views)
     spent, busy = time.perf_counter() - began, time.process_time() - cpu
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
@@ -97,7 +97,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, nargs="+", default=[1000, 10000], help="pictures, both cameras together")
     parser.add_argument("--preset", default="mild")
-    parser.add_argument("--task", choices=("decode", "detect"))
+    parser.add_argument("--every", type=int, nargs="+", default=[1, 4], help="search every n-th frame")
+    parser.add_argument("--task", help="decode, or the n of every n-th frame searched; for this script's own processes")
     parser.add_argument("--path", type=Path)
     options = parser.parse_args()
     if options.task:
@@ -110,10 +111,13 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for frames in options.frames:
             path = make_recording(Path(folder), options.preset, frames // 2)
-            for task in ("decode", "detect"):
+            alone = 0.0
+            for task in ("decode", *(str(n) for n in options.every)):
                 count, spent, busy, peak = measure(task, path)
-                row = f"| {count:.0f} | {task} | {count / spent:.0f} | {1e3 * busy / count:.2f} | {peak:.0f} |"
-                print(row, flush=True)
+                alone = alone or spent
+                name = "decoding alone" if task == "decode" else f"lines, every {task}"
+                speed = f"{count / spent:.0f} | {100 * alone / spent:.0f} %"
+                print(f"| {count:.0f} | {name} | {speed} | {1e3 * busy / count:.2f} | {peak:.0f} |", flush=True)
 
 
 if __name__ == "__main__":

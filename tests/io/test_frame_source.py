@@ -48,6 +48,17 @@ def test_every_container_gives_every_frame_once_in_order(tmp_path: Path, name: s
     np.testing.assert_allclose(source.times_s, np.arange(FRAMES) / FPS, atol=1e-3)
 
 
+@pytest.mark.parametrize("kind", ["video", "images"])
+def test_every_third_frame(tmp_path: Path, kind: str) -> None:
+    path = write_video(tmp_path / "v.mp4") if kind == "video" else write_images(tmp_path / "images", FRAMES)
+    source = open_source(path)
+    batches = list(source.batches(3, every=3))
+    assert [batch.indices.tolist() for batch in batches] == [[0, 3, 6], [9]]
+    assert torch.equal(torch.cat([batch.images for batch in batches]), source.frames([0, 3, 6, 9]))
+    with pytest.raises(InputError, match="every: expected at least 1, found 0"):
+        source.batches(3, every=0)
+
+
 @pytest.mark.parametrize(("name", "codec", "options"), CONTAINERS)
 def test_random_access_equals_sequential(tmp_path: Path, name: str, codec: str, options: dict) -> None:
     source = open_source(write_video(tmp_path / name, codec=codec, container_options=options))
