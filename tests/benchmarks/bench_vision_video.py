@@ -94,7 +94,7 @@ def measure(task: str, path: Path) -> list[float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--frames", type=int, nargs="+", default=[1000, 10000], help="pictures, both cameras together")
     parser.add_argument("--preset", default="mild")
     parser.add_argument("--every", type=int, nargs="+", default=[1, 4], help="search every n-th frame")
