@@ -145,7 +145,8 @@ class ShaftDetector:
     def _measure(self, images: Tensor, found: Found, stages: Stages, broken: Bool[Tensor, " b"]) -> ShaftDetections:
         """Sub-pixel contours, axis and end of the traced strips."""
         trace, keep, scores = found.trace, found.keep, found.scores
-        picture = FullPicture(images, trace.strips.frame, self.lens)
+        decoded = images.contiguous(memory_format=torch.channels_last)  # a copy only of planar pictures
+        picture = FullPicture(decoded, trace.strips.frame, self.lens)
         points, fit = self._contours(picture, trace)
         strips = replace(trace.strips, offset=fit.offset, slope=fit.slope)
         floor = 5 * self.settings.sigma_floor_px

@@ -30,14 +30,17 @@ def scene_tint(rgb: Float[Tensor, "b 3 h w"], seen: Bool[Tensor, "b h w"]) -> Fl
     Lab found 50 of the 57 labelled real shafts, this 54 (tests/benchmarks/bench_vision_real_frames.py).
     """
     red, green, blue = rgb.unbind(1)
-    value = rgb.amax(1) + _TONE_FLOOR
-    warm, yellow = (red - green) / value, (0.5 * (red + green) - blue) / value
+    # In place wherever it can be: a batch's fresh pages cost more than its sums.
+    value = rgb.amax(1).add_(_TONE_FLOOR)
+    warm, yellow = (red - green).div_(value), (red + green).mul_(0.5).sub_(blue).div_(value)
     weight = seen.to(rgb.dtype)
     total = weight.sum((1, 2)).clamp(min=1.0)
     mean_warm, mean_yellow = (warm * weight).sum((1, 2)) / total, (yellow * weight).sum((1, 2)) / total
     size = torch.sqrt(mean_warm.square() + mean_yellow.square()).clamp(min=1e-3)
-    along = warm * (mean_warm / size)[:, None, None] + yellow * (mean_yellow / size)[:, None, None]
-    return 0.5 * (torch.sqrt(warm * warm + yellow * yellow) + along)
+    along = torch.mul(warm, (mean_warm / size)[:, None, None], out=value)
+    along.addcmul_(yellow, (mean_yellow / size)[:, None, None])
+    chroma = warm.mul_(warm).addcmul_(yellow, yellow).sqrt_()
+    return chroma.add_(along).mul_(0.5)
 
 
 def unlikeness(
@@ -48,8 +51,8 @@ def unlikeness(
     Returns:
         the sum, in which a step of 0.1 is a tenth in brightness, and log brightness alone, both smoothed.
     """
-    tone = smooth((rgb.amax(1) + _TONE_FLOOR).log())
-    return tone + _TINT_WEIGHT * smooth(scene_tint(rgb, seen)), tone
+    tone = smooth(rgb.amax(1).add_(_TONE_FLOOR).log_())
+    return smooth(scene_tint(rgb, seen)).mul_(_TINT_WEIGHT).add_(tone), tone
 
 
 def smooth(picture: Float[Tensor, "b h w"]) -> Float[Tensor, "b h w"]:
