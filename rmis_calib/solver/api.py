@@ -1,7 +1,6 @@
 """One call from a problem to a solution."""
 
 from dataclasses import replace
-from typing import Any
 
 import torch
 from jaxtyping import Int
@@ -17,8 +16,12 @@ from rmis_calib.solver.paper import average, empirical_covariance, influence, so
 from rmis_calib.solver.problem import MIN_MOTIONS, Problem
 from rmis_calib.solver.relinearise import Kinematics, solve_relinearised
 from rmis_calib.solver.settings import SolverSettings
-from rmis_calib.solver.solution import MotionReason, Nuisance, Rival, Solution
+from rmis_calib.solver.solution import MotionReason, Rival, Solution, concatenate, map_tensors
 from rmis_calib.solver.statistics import LineStatistics
+
+GROUP_MOTIONS = 32768
+"""Motions (times trials) that are solved together: a batch of trials is cut into groups whose tensors stay in the
+cache, and in which nobody waits for a trial that takes more steps. Each group has a seed of its own."""
 
 
 def solve(
@@ -42,20 +45,44 @@ def solve(
         InsufficientDataError: too few measured lines in some trial.
     """
     settings = settings or SolverSettings()
-    method = method or settings.method
-    flat = problem.flatten_batch()
+    with torch.inference_mode():  # no graph is kept: a fifth of the time of 1,728 motions
+        solution = _solve_groups(problem.flatten_batch(), settings, method or settings.method, kinematics, rival)
+    return _shaped(solution, problem.batch_shape)
+
+
+def _solve_groups(
+    flat: Problem, settings: SolverSettings, method: str, kinematics: Kinematics | None, rival: Rival | None
+) -> Solution:
+    """All trials, in groups where they are many."""
     _check(flat)
-    if method == "joint":
-        index, kept = None, 1.0
-        if settings.thin_to is not None and settings.thin_to < flat.n_motions:
-            index, kept = _informative(flat, settings, settings.thin_to)
-            flat = flat.select_motions(index)
-        fit = solve_joint(flat, settings) if kinematics is None else solve_relinearised(flat, settings, kinematics)
-        solution = joint_solution(fit, settings, rival)
-        if index is not None:
-            solution = replace(_spread(solution, index, problem.n_motions), information_kept=kept)
-        return _shaped(solution, problem.batch_shape)
-    return _shaped(_solve_two_step(flat, settings, method), problem.batch_shape)
+    count = max(1, GROUP_MOTIONS // flat.n_motions)
+    alone = kinematics is not None or rival is not None or settings.thin_to is not None
+    if flat.n_trials <= count or alone:
+        return _solve_flat(flat, settings, method, kinematics, rival)
+    groups = [
+        _solve_flat(flat.take_trials(slice(b, b + count)), replace(settings, seed=settings.seed + b), method)
+        for b in range(0, flat.n_trials, count)
+    ]
+    return concatenate(groups)
+
+
+def _solve_flat(
+    flat: Problem,
+    settings: SolverSettings,
+    method: str,
+    kinematics: Kinematics | None = None,
+    rival: Rival | None = None,
+) -> Solution:
+    """Trials that are solved together, checked before."""
+    if method != "joint":
+        return _solve_two_step(flat, settings, method)
+    chosen, index, kept = flat, None, 1.0
+    if settings.thin_to is not None and settings.thin_to < flat.n_motions:
+        index, kept = _informative(flat, settings, settings.thin_to)
+        chosen = flat.select_motions(index)
+    fit = solve_joint(chosen, settings) if kinematics is None else solve_relinearised(chosen, settings, kinematics)
+    solution = joint_solution(fit, settings, rival)
+    return solution if index is None else replace(_spread(solution, index, flat.n_motions), information_kept=kept)
 
 
 def _solve_two_step(flat: Problem, settings: SolverSettings, method: str) -> Solution:
@@ -131,16 +158,14 @@ def _check(problem: Problem) -> None:
 
 
 def _shaped(solution: Solution, batch: torch.Size) -> Solution:
-    """The solution with the problem's own batch shape."""
+    """The solution with the problem's own batch shape, in tensors that autograd may use (copies: those made in
+    inference mode it may not)."""
 
-    def shaped(value: Any) -> Any:
-        if isinstance(value, Tensor):
-            return value.reshape((*batch, *value.shape[1:]))
-        if isinstance(value, dict):
-            return {key: shaped(item) for key, item in value.items()}
-        if isinstance(value, Nuisance):
-            return replace(value, **{k: shaped(v) for k, v in vars(value).items() if isinstance(v, Tensor)})
-        return value
+    def shaped(value: Tensor) -> Tensor:
+        return value.clone().reshape((*batch, *value.shape[1:]))
 
-    names = [name for name in vars(solution) if name not in ("sight", "posterior", "history")]
-    return replace(solution, **{name: shaped(getattr(solution, name)) for name in names})
+    flat = ("sight", "posterior", "history")
+    return replace(
+        solution,
+        **{name: map_tensors(item, torch.clone if name in flat else shaped) for name, item in vars(solution).items()},
+    )

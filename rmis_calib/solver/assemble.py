@@ -12,14 +12,14 @@ from rmis_calib.solver.competition import cheirality
 from rmis_calib.solver.initialise import COLLAPSED_MM, collapsed
 from rmis_calib.solver.joint import JointFit
 from rmis_calib.solver.measurements import END, HEAD, LINE, Packed, pack
-from rmis_calib.solver.normal import NoiseModel, accumulate
+from rmis_calib.solver.normal import NoiseModel, motion_distance2
 from rmis_calib.solver.observability import Degeneracy, look, recognise
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.residuals import State, residual_rows
 from rmis_calib.solver.robust import REJECTED
-from rmis_calib.solver.settings import SolverSettings, UnknownSettings
+from rmis_calib.solver.settings import SolverSettings
 from rmis_calib.solver.solution import MotionReason, Nuisance, Posterior, Rival, Sight, Solution, SolveStatus
-from rmis_calib.solver.unknowns import TRANSLATION_SIGMA_MM, UNITS, Nominal, initial_state, make_layout
+from rmis_calib.solver.unknowns import TRANSLATION_SIGMA_MM, UNITS, Nominal, initial_state
 from rmis_calib.solver.variance import COMPONENTS, assumed_noise
 
 MIN_CHEIRALITY = 0.5
@@ -46,7 +46,7 @@ def two_step_solution(
         torch.isfinite(covariance).all(-1).all(-1) & torch.isfinite(t).all(-1), status, SolveStatus.NON_FINITE
     )
     seen = packed.line_ok.any(0).any(0)
-    excess = _chi2_per_dof(axis_only, state, noise, settings)
+    excess = _chi2_per_dof(packed, state, noise)
     status = torch.where((excess > MAX_CHI2_PER_DOF) & (status == SolveStatus.CONVERGED), SolveStatus.MISFIT, status)
     sight = _sight(axis_only, R, t, covariance, noise, (False, False, False), settings)
     static = (sight.degeneracy & Degeneracy.STATIC_LAPAROSCOPE) > 0
@@ -75,15 +75,11 @@ def two_step_solution(
     )
 
 
-def _chi2_per_dof(problem: Problem, state: State, noise: NoiseModel, settings: SolverSettings) -> Float[Tensor, " b"]:
+def _chi2_per_dof(packed: Packed, state: State, noise: NoiseModel) -> Float[Tensor, " b"]:
     """Weighted squared residuals over degrees of freedom, on a few hundred motions: a fit in the wrong basin shows
     here where the cheirality does not."""
-    part = problem.select_motions(slice(None, None, max(1, problem.n_motions // CHECKED_MOTIONS)))
-    packed = pack(part, settings.noise)
-    layout = make_layout(Nominal.of(part), packed, state, UnknownSettings(stereo=False), settings.noise)
-    normal = accumulate(packed, state, layout, noise, settings.chunk)
-    prior = layout.prior(state)
-    return (normal.chi2 - (prior[0].square() * prior[1]).sum(-1)) / (normal.rows - 6.0).clamp_min(1.0)
+    part = packed.narrow(slice(None), slice(None, None, max(1, packed.motions // CHECKED_MOTIONS)))
+    return motion_distance2(part, state, noise).sum(-1) / (part.rows_ok.sum((0, 2)) - 6.0).clamp_min(1.0)
 
 
 def _unseen_depth(flat: Problem, R: Tensor, t: Tensor) -> Float[Tensor, "b 6 6"]:
@@ -246,15 +242,12 @@ def _residuals(packed: Packed, state: State) -> _Residuals:
 
 
 def _residuals_of(packed: Packed, state: State) -> list[Float[Tensor, "b c n"]]:
-    """Lines, ends and heads of motions that fit into memory at once."""
-    r, ok = residual_rows(packed, state), packed.rows_ok
-    kinds, cameras = (torch.tensor(x, device=r.device) for x in (packed.row_kind, packed.row_camera))
-    out = []
+    """Lines, ends and heads of motions that fit into memory at once; rows take turns between the cameras."""
+    squares, ok, c = residual_rows(packed, state).square_(), packed.rows_ok, packed.cameras
+    out, start = [], 0
     for kind in (LINE, END, HEAD):
-        per_camera = []
-        for c in range(packed.cameras):
-            rows = torch.nonzero((kinds == kind) & (cameras == c))[:, 0]
-            count = ok[rows].sum(0)
-            per_camera.append(torch.where(count > 0, (r[rows].square().sum(0) / count.clamp_min(1)).sqrt(), torch.nan))
-        out.append(torch.stack(per_camera, dim=1))
+        part = slice(start, start + packed.row_kind.count(kind))
+        total, count = (x[part].unflatten(0, (-1, c)).sum(0) for x in (squares, ok))
+        out.append(torch.where(count > 0, (total / count.clamp_min(1)).sqrt(), torch.nan).transpose(0, 1))
+        start = part.stop
     return out

@@ -206,6 +206,12 @@ def _joined(parts: list[Normal]) -> Normal:
     return replace(parts[0], **sums, distance2=torch.cat([part.distance2 for part in parts], dim=-1))
 
 
+def motion_distance2(packed: Packed, state: State, noise: NoiseModel) -> Float[Tensor, "b n"]:
+    """Mahalanobis distance^2 of all measurements of each motion."""
+    rows, _ = linearise(packed, state)
+    return _distance2(rows.w, rows.a, rows.r, image_variance(packed, noise), packed.cameras, noise)
+
+
 def camera_distance2(
     packed: Packed, state: State, noise: NoiseModel, rows: Rows | None = None
 ) -> tuple[Float[Tensor, "c b n"], Float[Tensor, "c b n"]]:
@@ -215,18 +221,31 @@ def camera_distance2(
         rows: linearised at this state, where they are known.
     """
     rows = linearise(packed, state)[0] if rows is None else rows
-    c, b, n = packed.cameras, packed.trials, packed.motions
-    k = rows.r.shape[0] // c
+    c, b = packed.cameras, packed.trials
 
     def apart(x: Tensor) -> Tensor:
         """(*, k c, b, n) -> (*, k, c b, n): cameras as trials of their own."""
-        return x.unflatten(-3, (k, c)).flatten(-3, -2)
+        return x.unflatten(-3, (-1, c)).flatten(-3, -2)
 
-    system = rows.r.new_empty((k, k + 1, c * b, n))
     own = NoiseModel(**{name: value.repeat(c) for name, value in vars(noise).items()})
-    covariance(apart(rows.w), apart(rows.a), apart(image_variance(packed, noise)), 1, own, system[:, :k])
-    system[:, k] = apart(rows.r)
+    image = apart(image_variance(packed, noise))
+    distance2 = _distance2(apart(rows.w), apart(rows.a), apart(rows.r), image, 1, own)
+    return distance2.unflatten(0, (c, b)), apart(packed.rows_ok).sum(0).to(rows.r.dtype).unflatten(0, (c, b))
+
+
+def _distance2(
+    w: Float[Tensor, "3 k b n"],
+    a: Float[Tensor, "3 k b n"],
+    r: Float[Tensor, "k b n"],
+    image: Float[Tensor, "k b n"],
+    cameras: int,
+    noise: NoiseModel,
+) -> Float[Tensor, "b n"]:
+    """r^T S^-1 r of each motion."""
+    k = r.shape[0]
+    system = r.new_empty((k, k + 1, *r.shape[1:]))
+    covariance(w, a, image, cameras, noise, system[:, :k])
+    system[:, k] = r
     eliminate(system)
     pivots = system.diagonal(dim1=0, dim2=1).permute(2, 0, 1)
-    distance2 = (system[:, -1].square() / pivots).sum(0)
-    return distance2.unflatten(0, (c, b)), apart(packed.rows_ok).sum(0).to(rows.r.dtype).unflatten(0, (c, b))
+    return (system[:, -1].square() / pivots).sum(0)

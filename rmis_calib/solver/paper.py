@@ -108,8 +108,8 @@ def solve_paper(statistics: LineStatistics) -> tuple[Float[Tensor, "b c 3 3"], F
     """The estimate of each camera on its own (`camera_right_T_arm` both times)."""
     gram = statistics.rotation_gram.flatten(0, 1)
     R = refine_quaternion(gram, linear_rotation(gram)).unflatten(0, statistics.rotation_gram.shape[:2])
-    t = [solve_translation(statistics.camera(c), R[:, c, None])[0][:, 0] for c in range(R.shape[1])]
-    return R, torch.stack(t, dim=1)
+    t, _ = solve_translation(statistics.apart(), R.flatten(0, 1)[:, None])
+    return R, t[:, 0].unflatten(0, R.shape[:2])
 
 
 def average(

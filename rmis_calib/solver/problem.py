@@ -144,7 +144,7 @@ class Problem:
 
         return _map_tensors(self, lambda x, _: flat(x))
 
-    def take_trials(self, index: Tensor | int) -> "Problem":
+    def take_trials(self, index: Tensor | slice | int) -> "Problem":
         """The problem of some trials of the only batch axis, in this order; with a number, that trial without the
         axis."""
         return _map_tensors(self, lambda x, _: x[index])

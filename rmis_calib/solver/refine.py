@@ -22,7 +22,7 @@ INITIAL_DAMPING = 1e-4
 NULL_RIDGE = 1e-13
 """Added to the unit diagonal of a scaled system: a direction that the data do not see at all would else take its step
 from rounding."""
-PREDICTION_MARGIN = 0.1
+PREDICTION_MARGIN = 0.25
 """A pass is saved only where the step after it is predicted to be this part of the tolerance."""
 MAX_DAMPING = 1e8
 """Past this no step goes downhill to the working precision: the loop has stalled."""

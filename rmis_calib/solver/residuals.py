@@ -99,10 +99,13 @@ class State:
     def moved(self, step: dict[str, Tensor]) -> "State":
         """The state after a step, given by parameter block (`unknowns.Layout.blocks`)."""
         changed = {}
+        turns = [name for name in ("rotation", "stereo_rotation") if name in step]
+        angles = [step[name] for name in turns]
+        turned = dict(zip(turns, rotvec_to_matrix(torch.stack(angles)), strict=True)) if turns else {}
         if "rotation" in step:
-            changed["R"] = rotvec_to_matrix(step["rotation"]) @ self.R
+            changed["R"] = turned["rotation"] @ self.R
         if "stereo_rotation" in step:
-            changed["stereo_R"] = self.stereo_R @ rotvec_to_matrix(step["stereo_rotation"])
+            changed["stereo_R"] = self.stereo_R @ turned["stereo_rotation"]
         if "stereo_translation" in step:
             changed["stereo_t"] = self.stereo_t + (self.stereo_R @ step["stereo_translation"][..., None])[..., 0]
         for block, name in (("translation", "t"), ("rcm_offset", "rcm_offset"), ("joint_offset", "joint_offset")):

@@ -1,7 +1,9 @@
 """What a solve returns: the estimate, its uncertainty, a status with a sentence, and what the data cannot see."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass, replace
 from enum import IntEnum, StrEnum
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -236,3 +238,52 @@ class Solution:
     @property
     def converged(self) -> Bool[Tensor, "*batch"]:
         return self.status == SolveStatus.CONVERGED
+
+
+def map_tensors(value: Any, function: Callable[[Tensor], Tensor]) -> Any:
+    """The value with the function applied to every tensor in it, however deep."""
+    if isinstance(value, Tensor):
+        return function(value)
+    if isinstance(value, dict):
+        return {key: map_tensors(item, function) for key, item in value.items()}
+    if isinstance(value, tuple):
+        return tuple(map_tensors(item, function) for item in value)
+    if is_dataclass(value) and not isinstance(value, type):
+        return replace(
+            value, **{field.name: map_tensors(getattr(value, field.name), function) for field in fields(value)}
+        )
+    return value
+
+
+def concatenate(groups: list[Solution]) -> Solution:
+    """The solution of all trials from those of groups of them.
+
+    An unknown that a group does not have is NaN there, and held; the posterior is None where unknowns differ.
+    """
+    names = dict.fromkeys(name for group in groups for name in group.nuisances)
+    nuisances = {name: _joined([_nuisance(name, group, groups) for group in groups]) for name in names}
+    same = all(group.nuisances.keys() == names.keys() for group in groups)
+    parts = [replace(group, nuisances={}, posterior=group.posterior if same else None) for group in groups]
+    return replace(_joined(parts), nuisances=nuisances)
+
+
+def _joined(parts: list[Any]) -> Any:
+    """Tensors concatenated along the trials, wherever they are; everything else as in the first part."""
+    first = parts[0]
+    if isinstance(first, Tensor):
+        return torch.cat(parts)
+    if isinstance(first, dict):
+        return {key: _joined([part[key] for part in parts]) for key in first}
+    if is_dataclass(first) and not isinstance(first, type):
+        names = [field.name for field in fields(first)]
+        return replace(first, **{name: _joined([getattr(part, name) for part in parts]) for name in names})
+    return first
+
+
+def _nuisance(name: str, group: Solution, groups: list[Solution]) -> Nuisance:
+    """An unknown of a group; all NaN where only other groups have it."""
+    if name in group.nuisances:
+        return group.nuisances[name]
+    other = next(each.nuisances[name] for each in groups if name in each.nuisances)
+    empty = other.value.new_full((len(group.status), other.value.shape[-1]), torch.nan)
+    return Nuisance(empty, empty, other.unit, torch.ones_like(empty, dtype=torch.bool), empty, empty[:, 0])

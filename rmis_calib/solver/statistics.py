@@ -78,14 +78,15 @@ class LineStatistics:
     def _stride(self, other: "LineStatistics") -> int:
         return max(1, -(-(self.sample_p.shape[-2] + other.sample_p.shape[-2]) // SAMPLE))
 
-    def camera(self, index: int) -> "LineStatistics":
-        """Statistics of one camera alone."""
-        one = slice(index, index + 1)
+    def apart(self) -> "LineStatistics":
+        """Every camera of every trial as a trial of its own, cameras of one trial together."""
+        cameras = self.count.shape[1]
+        shared = ("sample_p", "sample_v")
         return LineStatistics(
             **{
-                f.name: getattr(self, f.name)[:, one]
-                if f.name not in ("sample_p", "sample_v")
-                else getattr(self, f.name)
+                f.name: getattr(self, f.name).repeat_interleave(cameras, dim=0)
+                if f.name in shared
+                else getattr(self, f.name).flatten(0, 1)[:, None]
                 for f in fields(self)
             }
         )

@@ -64,12 +64,12 @@ class Layout:
         """
         zero, origin = torch.zeros_like(state.t), self.origin
         turned = origin.stereo_R.mT @ state.stereo_R
+        (_, yx, zx), (xy, _, zy), (xz, yz, _) = (column.unbind(-1) for column in turned.unbind(-1))
         shifted = (origin.stereo_R.mT @ (state.stereo_t - origin.stereo_t)[..., None])[..., 0]
         deviation = {
             "rotation": zero,
             "translation": state.t,
-            "stereo_rotation": 0.5
-            * torch.stack([turned[:, i, j] - turned[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], dim=-1),
+            "stereo_rotation": 0.5 * torch.stack((zy - yz, xz - zx, yx - xy), dim=-1),
             "stereo_translation": shifted,
             "radius": (state.radius - origin.radius)[:, None],
             "end_offset": (state.end_offset - origin.end_offset)[:, None],

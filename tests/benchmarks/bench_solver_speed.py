@@ -7,21 +7,24 @@ import argparse
 import resource
 import sys
 import time
-from dataclasses import fields, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-import numpy as np
 import torch
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from rmis_calib.solver import LineStatistics, Problem, SolverSettings, solve
 from rmis_calib.solver.initialise import find_candidates
+from rmis_calib.solver.measurements import pack
+from rmis_calib.solver.residuals import linearise, residual_rows
+from rmis_calib.solver.unknowns import Nominal, columns, initial_state, make_layout
 from tests.benchmarks.solver_common import (
     KNOWN_RADIUS,
     REALISTIC,
+    Study,
     config,
     errors,
     median_seconds,
@@ -29,69 +32,10 @@ from tests.benchmarks.solver_common import (
     study,
     translation_mm,
 )
+from tests.benchmarks.solver_peers import AnalyticPeer, NumpyPeer, transform
 
-
-def scipy_joint(problem: Problem, start: np.ndarray, end_offset: float) -> np.ndarray:
-    """The same weighted joint estimate by SciPy: a plain user's residual function in NumPy, with latent poses
-    eliminated by whitening with the noise at the start.
-
-    Twelve shared unknowns and the end offset; residuals of both contours, ends, both cameras; Jacobian by finite
-    differences, as by default.
-    """
-    P = {
-        f.name: getattr(problem, f.name)[0].numpy()
-        for f in fields(problem)
-        if isinstance(getattr(problem, f.name), torch.Tensor) and getattr(problem, f.name).ndim > 1
-    }
-    radius = float(problem.radius_mm[0])
-    noise = {f.name: float(getattr(problem.noise, f.name)[0]) for f in fields(problem.noise)}
-    Z0 = P["camera_T_camera_right"][1]
-
-    def rows(x, A, v):
-        R, t = Rotation.from_rotvec(x[:3]).as_matrix(), x[3:6]
-        Z = np.eye(4)
-        Z[:3, :3], Z[:3, 3] = Rotation.from_rotvec(x[6:9]).as_matrix() @ Z0[:3, :3], Z0[:3, 3] + x[9:12]
-        p0, d0 = A[:, :3, 3] @ R.T + t, np.einsum("nij,nj->ni", A[:, :3, :3], v) @ R.T
-        out = []
-        for c, T in enumerate((np.eye(4), Z)):
-            p, d = p0 @ T[:3, :3].T + T[:3, 3], d0 @ T[:3, :3].T
-            M = np.cross(p, d)
-            D = np.linalg.norm(M, axis=1)
-            m = M / D[:, None]
-            u = np.cross(d, m)
-            sine = radius / D
-            for edge, sign in enumerate((1.0, -1.0)):
-                n = np.sqrt(1.0 - sine**2)[:, None] * m + sign * sine[:, None] * u
-                scale = np.hypot(n[:, 0], n[:, 1])
-                for point in range(2):
-                    xy = P["contour_xy"][c, :, edge, point]
-                    out.append((n[:, 0] * xy[:, 0] + n[:, 1] * xy[:, 1] + n[:, 2]) / scale)
-            q = p + (P["rcm_s_end_mm"] + x[12])[:, None] * d
-            along = np.stack((-m[:, 1], m[:, 0]), 1) / np.hypot(m[:, 0], m[:, 1])[:, None]
-            out.append(((P["end_xy"][c] - q[:, :2] / q[:, 2:]) * along).sum(1))
-        return np.nan_to_num(np.stack(out, 1))
-
-    A, v = P["arm_T_rcm"], P["rcm_v_axis"]
-    x0 = np.concatenate((Rotation.from_matrix(start[:3, :3]).as_rotvec(), start[:3, 3], np.zeros(6), [end_offset]))
-    base = rows(x0, A, v)
-    covariance = np.tile(noise["image"] ** 2 * np.eye(10), (len(A), 1, 1))
-    for axis in range(6):
-        step = np.zeros(6)
-        step[axis] = 1e-5 if axis < 3 else 1e-4
-        E = np.eye(4)
-        E[:3, :3], E[:3, 3] = Rotation.from_rotvec(step[:3]).as_matrix(), step[3:]
-        J = (rows(x0, A @ E, v) - base) / step[axis] * (noise["kinematics_rad"] if axis < 3 else noise["kinematics_mm"])
-        covariance += J[:, :, None] * J[:, None]
-    whiten = np.linalg.inv(np.linalg.cholesky(covariance))
-    prior = np.concatenate((np.full(3, noise["stereo_rad"]), np.full(3, noise["stereo_mm"])))
-
-    def residuals(x):
-        return np.concatenate((np.einsum("nij,nj->ni", whiten, rows(x, A, v)).ravel(), x[6:12] / prior))
-
-    x = least_squares(residuals, x0, method="trf", x_scale="jac").x
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = Rotation.from_rotvec(x[:3]).as_matrix(), x[3:6]
-    return out
+END_OFFSET_MM = -18.0
+"""Where SciPy starts the end's offset: 2 mm from the truth."""
 
 
 def tiled(problem: Problem, n: int) -> Problem:
@@ -108,6 +52,73 @@ def peak_gb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
 
 
+def show_scipy(trial: Study, settings: SolverSettings, joint_seconds: float, quick: bool) -> None:
+    """SciPy on the same problem, from the answer of `global` (solver_peers.py says how each user writes it)."""
+    start = solve(trial.problem, settings, "global").camera_right_T_arm[0]
+    peer = NumpyPeer(trial.problem)
+    analytic = AnalyticPeer(trial.problem, settings, start, END_OFFSET_MM)
+    x = peer.start(start.numpy(), END_OFFSET_MM)
+    rows: list[tuple[str, Callable[[], torch.Tensor], int]] = [
+        ("marginalised, weights of the start, 2-point", lambda: transform(peer.marginalised(x, 1)), 3),
+        ("marginalised, weights of the estimate, 2-point", lambda: transform(peer.marginalised(x, 2)), 3),
+        ("marginalised, weights of the estimate, our Jacobian", lambda: analytic.solve(2), 3),
+    ]
+    if not quick:
+        rows.append(("latent poses, sparse 2-point", lambda: transform(peer.latent(x)), 1))
+    print("SciPy least_squares, 1,728 stereo motions         ms   times joint   error deg       mm")
+    for name, function, repeats in rows:
+        seconds = median_seconds(function, repeats)
+        print(
+            f"{name:48}{1e3 * seconds:8.0f} {seconds / joint_seconds:9.1f}     {_error(function(), trial)}", flush=True
+        )
+    ours = solve(trial.problem, settings).camera_right_T_arm
+    print(f"{'joint':48}{1e3 * joint_seconds:8.0f} {1.0:9.1f}     {_error(ours, trial)}")
+
+
+def _error(estimate: torch.Tensor, trial: Study) -> str:
+    e = errors(estimate, trial.truth)
+    return f"{float(rotation_deg(e)[0]):10.4f} {float(translation_mm(e)[0]):8.4f}"
+
+
+def show_jacobians(trial: Study, settings: SolverSettings) -> None:
+    """Residuals of all 1,728 motions with their Jacobian in the 13 unknowns: analytic, torch.func and autograd."""
+    problem = trial.problem
+    packed = pack(problem, settings.noise)
+    found = solve(problem, settings)
+    X, end_offset = found.camera_right_T_arm, found.nuisances["end_offset"].value[:, 0]
+    state = replace(initial_state(Nominal.of(problem), X[:, :3, :3], X[:, :3, 3]), end_offset=end_offset)
+    layout = make_layout(Nominal.of(problem), packed, state, settings.unknowns, settings.noise)
+    single = packed.gather(torch.zeros(packed.motions, dtype=torch.int64), torch.arange(packed.motions))
+    each = state.take(torch.zeros(packed.motions, dtype=torch.int64))
+
+    def analytic() -> torch.Tensor:
+        rows, shaft = linearise(packed, state)
+        return columns(layout, rows, shaft, packed, state)[:, :, 0]  # (k, p, n)
+
+    def residuals(delta: torch.Tensor) -> torch.Tensor:
+        return residual_rows(packed, state.moved(layout.step(delta[None])))[:, 0]
+
+    def forward() -> torch.Tensor:
+        zero = torch.zeros(layout.size, dtype=torch.float64)
+        return cast(torch.Tensor, torch.func.jacfwd(residuals)(zero)).transpose(1, 2)
+
+    def backward() -> torch.Tensor:
+        """Every motion with unknowns of its own, so that one backward pass a row serves all motions."""
+        delta = torch.zeros(packed.motions, layout.size, dtype=torch.float64, requires_grad=True)
+        r = residual_rows(single, each.moved(layout.step(delta)))[..., 0]
+        rows = [torch.autograd.grad(row.sum(), delta, retain_graph=True)[0] for row in r]
+        return torch.stack(rows).transpose(1, 2)
+
+    exact, base = analytic(), 0.0
+    print("Jacobian of 1,728 stereo motions     ms   times   largest difference of the analytic one, of the column")
+    for name, function in (("analytic", analytic), ("torch.func.jacfwd", forward), ("torch.autograd", backward)):
+        seconds = median_seconds(function, 9)
+        base = base or seconds
+        scale = exact.abs().amax((0, 2), keepdim=True)
+        gap = float(((function() - exact) / scale).abs().max())
+        print(f"{name:28}{1e3 * seconds:10.2f} {seconds / base:7.1f}   {gap:.1e}", flush=True)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser()
     parser.add_argument("--quick", action="store_true")
@@ -118,14 +129,9 @@ def main() -> int:
     medians = {}
     for method in ("paper", "global", "joint"):
         medians[method] = median_seconds(lambda method=method: solve(trial.problem, settings, method), 15)
-        print(f"1,728 stereo motions, {method:7}: {1e3 * medians[method]:8.1f} ms")
-    start = solve(trial.problem, settings, "global").camera_right_T_arm[0].numpy()
-    seconds = median_seconds(lambda: scipy_joint(trial.problem, start, -18.0), 3)
-    e = errors(torch.as_tensor(scipy_joint(trial.problem, start, -18.0))[None], trial.truth)
-    ours = errors(solve(trial.problem, settings).camera_right_T_arm, trial.truth)
-    print(f"1,728 stereo motions, SciPy  : {1e3 * seconds:8.1f} ms, {seconds / medians['joint']:.1f} times joint")
-    for name, error in (("SciPy", e), ("joint", ours)):
-        print(f"    error of {name}: {float(rotation_deg(error)[0]):.4f} deg, {float(translation_mm(error)[0]):.4f} mm")
+        print(f"1,728 stereo motions, {method:7}: {1e3 * medians[method]:8.1f} ms", flush=True)
+    show_scipy(trial, settings, medians["joint"], args.quick)
+    show_jacobians(trial, settings)
     for n in (1_000, 10_000, 100_000) + (() if args.quick else (1_000_000,)):
         big = tiled(trial.problem, n)
         begin = time.perf_counter()

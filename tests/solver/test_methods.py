@@ -11,6 +11,7 @@ from rmis_calib.solver.observability import VERDICTS
 from rmis_calib.solver.paper import linear_rotation, quaternion_derivatives, solve_paper
 from rmis_calib.solver.rotation_search import vec
 from rmis_calib.solver.settings import NoiseSettings, UnknownSettings
+from rmis_calib.solver.solution import concatenate
 
 EXACT = UnknownSettings(radius_sigma_relative=0.0)
 
@@ -130,3 +131,27 @@ def test_quaternion_derivatives_equal_autograd():
     torch.testing.assert_close((tangent @ gradient[..., None])[..., 0], expected)
     J = torch.func.vmap(torch.func.jacrev(lambda x: vec(quat_to_matrix(x))))(q.detach())
     torch.testing.assert_close(tangent @ curvature @ tangent, 2.0 * J.mT @ gram @ J)
+
+
+@pytest.mark.parametrize("method", ["global", "joint"])
+def test_groups_of_trials_are_solved_as_one_batch(simulate, realistic, method, monkeypatch):
+    """Up to the solver's tolerance: in one batch no trial stops before the last."""
+    problem, _, _ = simulate(**realistic | {"trials": 3})
+    settings = SolverSettings(unknowns=EXACT, bias_correction=False)  # simulations draw anew in each group
+    whole = solve(problem, settings, method)
+    monkeypatch.setattr("rmis_calib.solver.api.GROUP_MOTIONS", 2 * problem.n_motions)
+    grouped = solve(problem, settings, method)
+    for name in ("camera_right_T_arm", "covariance", "distance", "residual_lines"):
+        torch.testing.assert_close(getattr(grouped, name), getattr(whole, name), equal_nan=True, rtol=1e-3, atol=1e-7)
+    assert grouped.status.tolist() == whole.status.tolist()
+    assert grouped.noise.keys() == whole.noise.keys() and grouped.nuisances.keys() == whole.nuisances.keys()
+    assert grouped.sight.sigma_mm.shape == whole.sight.sigma_mm.shape
+
+
+def test_an_unknown_that_some_trials_lack_is_held_in_them(simulate, realistic):
+    problem, _, _ = simulate(**realistic)
+    with_radius, without = solve(problem), solve(problem.only("axis"))
+    both = concatenate([with_radius, without])
+    b = problem.n_trials
+    torch.testing.assert_close(both.nuisances["radius"].value[:b], with_radius.nuisances["radius"].value)
+    assert bool(both.nuisances["radius"].value[b:].isnan().all()) and bool(both.nuisances["radius"].held[b:].all())
