@@ -75,6 +75,12 @@ class CalibrationRun:
     observations: ShaftObservations | None
     solution: Solution | None
 
+    @property
+    def clock_s(self) -> float | None:
+        """Clock offset that was found; None where it is no unknown or the data cannot tell it."""
+        clock = None if self.solution is None else self.solution.nuisances.get("clock")
+        return None if clock is None or bool(clock.held) else float(clock.value)
+
     def predicted_contours(self, view: View) -> Float[Tensor, "m 2 3"] | None:
         """Contour planes where the result puts the shaft, in one view's camera."""
         camera_T_arm = self._camera_T_arm(view)
@@ -146,9 +152,9 @@ def run_calibration(
         better = _choose_again(run)
         if better is None or all(new.same_as(old) for new, old in zip(better, run.choices, strict=True)):
             break
-        run = _solve_choice(recording, draft, views, poses, better, progress)
+        run = _solve_choice(recording, draft, views, poses, better, progress, run.clock_s)
     if draft != config:
-        run = _solve_choice(recording, config, views, poses, run.choices, progress)
+        run = _solve_choice(recording, config, views, poses, run.choices, progress, run.clock_s)
     return _advised(run, config)
 
 
@@ -167,8 +173,9 @@ def _solve_choice(
     poses: MotionPoses,
     choices: tuple[Choice, ...],
     progress: Progress,
+    clock_s: float | None = None,
 ) -> CalibrationRun:
-    """Assemble the chosen candidates, solve, and say what came out."""
+    """Assemble the chosen candidates, solve, and say what came out; `clock_s` saves the search for the clock."""
     seen = torch.stack([choice.taken for choice in choices]).any(dim=0)
     if int(seen.sum()) < config.min_motions:
         motions = _motions(recording, views, poses, choices, None)
@@ -180,7 +187,7 @@ def _solve_choice(
         if unknowns is None:
             solution, notes = estimate(observations, config), ()
         else:
-            solution, notes = estimate_with_kinematics(observations, config, unknowns)
+            solution, notes = estimate_with_kinematics(observations, config, unknowns, clock_s)
             poses, known = _at_estimate(unknowns, poses, solution)
             observations = assemble(recording, poses, views, tuple(c.where(known) for c in choices), config)
     except InsufficientDataError as error:

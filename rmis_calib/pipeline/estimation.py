@@ -74,7 +74,10 @@ def estimate(observations: ShaftObservations, config: CalibrationConfig) -> Solu
 
 
 def estimate_with_kinematics(
-    observations: ShaftObservations, config: CalibrationConfig, unknowns: KinematicUnknowns
+    observations: ShaftObservations,
+    config: CalibrationConfig,
+    unknowns: KinematicUnknowns,
+    clock_s: float | None = None,
 ) -> tuple[Solution, tuple[str, ...]]:
     """The same with constant joint offsets, and the clock offset, among the unknowns of `joint`; and what was decided
     about the offsets, in sentences.
@@ -82,21 +85,29 @@ def estimate_with_kinematics(
     An offset that the data cannot tell from the transform (its sigma stays at its prior) is held at zero: its prior
     would else be counted as uncertainty of a transform that absorbs it anyway. With `auto` all offsets are left out
     when a robot without any explains the data better; the covariance then allows for the other possibility.
+
+    Args:
+        observations: N motions.
+        config: method, measurements to use, noise, unknowns.
+        unknowns: the kinematics as a function of the offsets.
+        clock_s: clock offset found before, to start from; None: it is searched for.
     """
     base = problem_of(observations, config).flatten_batch()
     asked = config.solver.unknowns
     sigma = unknowns.prior_sigma(asked)
     if asked.joint_offsets == "never":
         sigma = sigma * 0.0
-    clock_s = sigma.new_zeros(1)
-    if asked.clock and unknowns.has_clock:
-        clock_s = clock_s + _clock_start(base, unknowns, config.clock_search_s, sigma)
+    if not (asked.clock and unknowns.has_clock):
+        clock_s = 0.0
+    elif clock_s is None:
+        clock_s = _clock_start(base, unknowns, config.clock_search_s, sigma)
+    clock_at = sigma.new_full((1,), clock_s)
 
     def solve_with(sigma: torch.Tensor, rival: Rival | None = None) -> Solution:
         def kinematics(joint_offset: torch.Tensor, clock_s: torch.Tensor) -> Problem:
             return unknowns.linearised(base, joint_offset, clock_s, sigma)
 
-        start = kinematics(torch.zeros_like(sigma)[None], clock_s)
+        start = kinematics(torch.zeros_like(sigma)[None], clock_at)
         return solve_problem(start.take_trials(0), config.solver, kinematics=kinematics, rival=rival)
 
     solution = solve_with(sigma)

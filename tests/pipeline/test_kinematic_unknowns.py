@@ -101,6 +101,10 @@ def test_clock_offset_is_found_from_most_of_a_second_away(moving):
     clock = solution.nuisances["clock"]
     assert float(clock.value) == pytest.approx(CLOCK_S, abs=0.01)
     assert not bool(clock.held)
+    again, _ = estimate_with_kinematics(observations, parse_config({}), unknowns, float(clock.value))
+    moved = again.camera_right_T_arm[:3, 3] - solution.camera_right_T_arm[:3, 3]
+    assert float(moved.norm()) < 0.05 * float(solution.translation_sigma_mm)  # what ends relinearisation
+    assert float((again.nuisances["clock"].value - clock.value).abs()) < 0.05 * float(clock.sigma)
 
 
 def test_joint_offsets_are_found_within_their_sigmas_or_held(moving):
