@@ -96,10 +96,10 @@ def _solve_two_step(flat: Problem, settings: SolverSettings, method: str) -> Sol
     if method == "paper":
         R_each, t_each = solve_paper(statistics)
         R, t = average(R_each, t_each)
-        shares = torch.stack([influence(part, R_each[:, c], t_each[:, c], (c,)) for c in range(flat.n_cameras)]).mean(0)
+        shares = influence(part, R_each, t_each)
     else:
         R, t, _ = find_candidates(statistics, settings.grid, settings.minima).best()
-        shares = influence(part, R, t, tuple(range(flat.n_cameras)))
+        shares = influence(part, R[:, None], t[:, None])
     covariance = empirical_covariance(shares) * (part.n_motions / flat.n_motions)
     return two_step_solution(flat, R, t, covariance, settings, method)
 

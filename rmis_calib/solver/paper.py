@@ -119,30 +119,29 @@ def average(
     return chordal_mean(R), t.mean(1)
 
 
-def influence(
-    problem: Problem, R: Float[Tensor, "b 3 3"], t: Float[Tensor, "b 3"], cameras: tuple[int, ...]
-) -> Float[Tensor, "b n 6"]:
-    """Each motion's share in the error of the two-step estimate (rotation, then translation) from these cameras.
+def influence(problem: Problem, R: Float[Tensor, "b c 3 3"], t: Float[Tensor, "b c 3"]) -> Float[Tensor, "b n 6"]:
+    """Each motion's share in the error of the two-step estimate (rotation, then translation).
+
+    With one R and t a camera (c > 1), each camera's own estimate from its own lines, and the mean of their shares; with
+    c = 1, one estimate from the lines of all cameras.
 
     The estimate solves sum psi_1 = 0, psi_1 = (R v x n)(n.R v), and sum psi_2 = 0, psi_2 = n (n.(R p + t + o)). To
     first order the error is -A^-1 sum psi with A the block-triangular derivative: dphi = -H1^-1 sum psi_1, dt = -H2^-1
-    (sum psi_2 + B dphi). The empirical covariance is the sum of
-    squared shares: it needs no noise model (White 1980).
+    (sum psi_2 + B dphi). The empirical covariance is the sum of squared shares: it needs no noise model (White 1980).
     """
+    b, estimates = R.shape[:2]
     n, _, ok = plane_normals(problem)
-    n, known = n[:, list(cameras)], ok[:, list(cameras)].to(n.dtype)[..., None]
+    R_Z, t_Z = problem.camera_T_camera_right[..., :3, :3], problem.camera_T_camera_right[..., :3, 3]
+    offset = (R_Z.mT @ t_Z[..., None])[..., 0]
     arm_v = (problem.arm_T_rcm[..., :3, :3] @ problem.rcm_v_axis[..., None])[..., 0]
-    v = (arm_v @ R.mT)[:, None].expand_as(n)
-    turned = problem.arm_T_rcm[..., :3, 3] @ R.mT
-    R_Z, t_Z = (
-        problem.camera_T_camera_right[:, list(cameras), :3, :3],
-        problem.camera_T_camera_right[:, list(cameras), :3, 3],
-    )
-    offset = (R_Z.mT @ t_Z[..., None])[..., 0][:, :, None]
-    j = torch.linalg.cross(v, n) * known  # d(n.Rv)/dphi
+    v, turned = ((x[:, None] @ R.mT).flatten(0, 1)[:, None] for x in (arm_v, problem.arm_T_rcm[..., :3, 3]))
+    # Estimates of each camera become trials of one camera; (b e, c / e, n, 3) from here.
+    n, ok, offset = (x.reshape(b * estimates, -1, *x.shape[2:]) for x in (n, ok, offset))
+    known = ok.to(n.dtype)[..., None]
+    j = torch.linalg.cross(v.expand_as(n), n) * known  # d(n.Rv)/dphi
     e1 = (n * v).sum(-1, keepdim=True)
-    e2 = (n * (turned[:, None] + t[:, None, None] + offset)).sum(-1, keepdim=True)
-    k = torch.linalg.cross(turned[:, None].expand_as(n), n)
+    e2 = (n * (turned + t.flatten(0, 1)[:, None, None] + offset[:, :, None])).sum(-1, keepdim=True)
+    k = torch.linalg.cross(turned.expand_as(n), n)
     weighted = n * known
     H1, H2 = _outer(j, j), _outer(weighted, n)
     B = _outer(weighted, k)
@@ -152,7 +151,7 @@ def influence(
     shift = -torch.linalg.solve(
         H2 + eye * H2.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None], (psi2 + phi @ B.mT).mT
     ).mT
-    return torch.cat((phi, shift), dim=-1)
+    return torch.cat((phi, shift), dim=-1).unflatten(0, (b, estimates)).mean(1)
 
 
 def _outer(a: Float[Tensor, "b c n 3"], b: Float[Tensor, "b c n 3"]) -> Float[Tensor, "b 3 3"]:
