@@ -61,14 +61,15 @@ def compete(
     outliers."""
     index = order[: settings.start_motions]
     sample = packed.take_motions(index)
-    if packed.has_contours:
+    starts = None if packed.has_contours else _starts(problem, packed, settings)
+    if starts is None:  # a closed form from the sample; the search over all motions only where it does not settle
         R, t = contour_starts(sample, torch.nan_to_num(problem.radius_mm), all_kinds=False)
     else:
-        R, t = (start[:, :1] for start in _starts(problem, packed, settings))
+        R, t = starts[0][:, :1], starts[1][:, :1]
     first = _race(problem, sample, R, t, assumed, free, settings, robust=False)
     if first.settled:
         return first.state, first.noise, False
-    R, t = _starts(problem, packed, settings)
+    R, t = _starts(problem, packed, settings) if starts is None else starts
     race = _race(problem, sample, R, t, assumed, free, settings, robust=False)
     state, noise = race.state, race.noise
     # A poor fit hides outliers where the noise levels are to be estimated: they are raised until it looks good.
