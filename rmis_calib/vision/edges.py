@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from rmis_calib.vision.runs import masked_median
 from rmis_calib.vision.sampling import FullPicture
@@ -19,6 +20,9 @@ from rmis_calib.vision.strips import Strips
 _BLURS = (0.5, 0.7, 0.95, 1.3, 1.8, 2.5, 3.4)
 # Ridge on the two slopes: enough to keep the system regular where a contour is flat, too little to bias its place.
 _SLOPE_RIDGE = 0.02
+# The separating colour is averaged over a sixth of the contour before and behind. Over a sixteenth the contours of the
+# preset carbon are 5 % better, but two more real shafts, out of focus and with little contrast, are lost.
+_NEIGHBOURS = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,12 +78,18 @@ def _read_bands(
 
 
 def _project(colours: Float[Tensor, "3 b k 2 p d"], use: Bool[Tensor, "b k 2 p"]) -> Float[Tensor, "b k 2 p d"]:
-    """Colours along the direction, unit length, that separates outside from inside of each contour."""
+    """Colours along the direction, unit length, that separates outside from inside of each contour.
+
+    The direction is that of the contrast in the neighbourhood: what lies beside a shaft changes along it, and may be
+    darker than the shaft here and lighter there.
+    """
     third = colours.shape[-1] // 3
-    contrast = colours[..., -third:].mean(-1) - colours[..., :third].mean(-1)
-    direction = (contrast * use).sum(-1)
-    direction = direction / direction.norm(dim=0).clamp(min=1e-6)
-    red, green, blue = colours * direction[..., None, None]
+    contrast = (colours[..., -third:].mean(-1) - colours[..., :third].mean(-1)) * use
+    reach = contrast.shape[-1] // _NEIGHBOURS
+    total = pad(contrast.cumsum(-1), (reach + 1, 0))
+    ahead = torch.cat([total[..., 2 * reach + 1 :], total[..., -1:].expand(*total.shape[:-1], reach)], -1)
+    direction = ahead - total[..., : contrast.shape[-1]]
+    red, green, blue = colours * (direction / direction.norm(dim=0).clamp(min=1e-6))[..., None]
     return red + green + blue
 
 

@@ -1,6 +1,6 @@
 """What the small picture says for each strip: where both contours are there and the inside looks like a shaft."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,6 +17,7 @@ from rmis_calib.vision.runs import (
     third_lowest,
 )
 from rmis_calib.vision.settings import DetectorSettings
+from rmis_calib.vision.shaft_mask import weighted_tint
 from rmis_calib.vision.strips import SmallPicture, Strips
 
 _STATIONS, _GLANCES = 96, 32
@@ -56,6 +57,22 @@ class Evidence:
     """Median over the shaft of the weaker contour's step."""
     purity: Float[Tensor, "b k"]
     """How much of the inside is shaft and how much of the surroundings is not, 0 to 1."""
+
+    def pick(self, index: Tensor) -> "Evidence":
+        """The strips with these indices, (b, k') int64."""
+        rows = torch.arange(index.shape[0], device=index.device)[:, None]
+        own = {f.name: getattr(self, f.name)[rows, index] for f in fields(self) if f.name not in ("strips", "t")}
+        return Evidence(strips=self.strips.pick(index), t=self.t, **own)
+
+    def views_together(self, views: int) -> "Evidence":
+        """The strips found in the views of one picture, which follow one another as frames, as those of one frame."""
+
+        def join(value: Tensor) -> Tensor:
+            return value.unflatten(0, (-1, views)).flatten(1, 2)
+
+        own = {f.name: join(getattr(self, f.name)) for f in fields(self) if f.name not in ("strips", "t")}
+        strips = {f.name: join(getattr(self.strips, f.name)) for f in fields(self.strips)}
+        return Evidence(strips=Strips(**strips), t=self.t, **own)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +114,7 @@ def _profiles(picture: SmallPicture, strips: Strips, t: Float[Tensor, " s"], nar
     outer = torch.minimum(torch.where(left_seen, left_outside, inf), torch.where(right_seen, right_outside, inf))
     one_side, both_sides = left_seen | right_seen, left_seen & right_seen
     middle = 0.5 * (inner + outer)
-    glare = _glare(value, tone)
+    glare = _glare(weighted_tint(value, tone, picture.lit(strips)), tone)
     # Beyond a contour there is neither more shaft nor the glare on it: else the strip is a part of a wider one.
     brighter_side = torch.maximum(left_outside, right_outside)
     open_beyond = torch.maximum(middle, inner + 0.35 * (brighter_side - inner))[:, :, None]
@@ -111,9 +128,8 @@ def _profiles(picture: SmallPicture, strips: Strips, t: Float[Tensor, " s"], nar
     return _Profiles(inner, outer, step, purity, is_open, both_sides, centre_seen, width)
 
 
-def _glare(value: Float[Tensor, "b k n s"], tone: Float[Tensor, "b k n s"]) -> Bool[Tensor, "b k n s"]:
+def _glare(tint: Float[Tensor, "b k n s"], tone: Float[Tensor, "b k n s"]) -> Bool[Tensor, "b k n s"]:
     """Points brighter than the surroundings of the strip that have lost their tint: light reflected by a shaft."""
-    tint = value - tone
     left, right = _INNER, _INNER + 3
     tinted = torch.maximum(tint[:, :, left], tint[:, :, right])[:, :, None]
     bright = torch.minimum(tone[:, :, left], tone[:, :, right])[:, :, None]

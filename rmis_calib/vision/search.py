@@ -8,16 +8,17 @@ enters would go unseen until then, for only what is spared would show it, and ba
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from rmis_calib.vision import hough, scoring, shaft_mask, strips, trace
 from rmis_calib.vision.canvas import Canvas, shrink
 from rmis_calib.vision.settings import DetectorSettings
 
-_LINES, _PAIRS, _STRIPS = 48, 160, 24
+_LINES, _PAIRS, _STRIPS = 48, 160, 20
 # Blurred ridges of the field's border reach this far into it, small px.
 _RIM_PX = 4
+_LIT_MERIT = 0.75
 # A ridge below this is texture: 4 per cent of brightness a small pixel.
 _MIN_GRADIENT = 0.04
 
@@ -29,7 +30,10 @@ class Stages:
     rgb: Float[Tensor, "b 3 h w"]
     seen: Bool[Tensor, "b h w"]
     unlike: Float[Tensor, "b h w"]
+    lit: Float[Tensor, "b h w"]
+    """The last view of `shaft_mask.unlikeness`."""
     ridge: Bool[Tensor, "b h w"]
+    """Of any view."""
     votes: Float[Tensor, "b angles rhos"]
     lines: hough.HoughLines
     evidence: scoring.Evidence
@@ -46,6 +50,8 @@ class Found:
 
     trace: trace.Trace
     """The kept ones as one list, (1, m)."""
+    frame: Int64[Tensor, "1 m"]
+    """Picture that each of the list lies in."""
     keep: Bool[Tensor, "b c"]
     """Which ranks of which frames are in the list; at least one."""
     scores: Float[Tensor, "b c"]
@@ -53,44 +59,78 @@ class Found:
 
 
 def search(
-    images: Tensor, canvas: Canvas, settings: DetectorSettings, count: int, masks: Tensor | None = None
+    images: Tensor, canvas: Canvas, settings: DetectorSettings, wanted: int, masks: Tensor | None = None
 ) -> tuple[Found, Stages]:
-    """The best `count` strips of each frame with their contours traced, and the stages that led there.
+    """The best `wanted` strips of each frame with their contours traced, and the stages that led there.
 
     Args:
         images: (b, 3, H, W), uint8 or floating point in [0, 1].
         canvas: the small picture's place.
         settings: limits of width, contrast, convergence.
-        count: strips wanted a frame.
+        wanted: strips a frame.
         masks: (b, H, W), 1 on shafts, which replace the colour stage.
     """
     small = shrink(images, canvas.factor)
     field, within = shaft_mask.field_of_view(small, settings.black_level, _RIM_PX)
     rgb, seen, well_inside = _lay_out(canvas, small, field, within)
     if masks is None:
-        unlike, tone = shaft_mask.unlikeness(rgb, seen)
+        views, tone = shaft_mask.unlikeness(rgb, seen)
     else:
         inside = canvas.lay_out(shrink(masks[:, None].to(torch.float32), canvas.factor))
-        unlike, tone = shaft_mask.smooth(1 - inside[:, 0]), torch.zeros_like(inside[:, 0])
+        views, tone = shaft_mask.smooth(1 - inside[:, 0])[:, None], torch.zeros_like(inside[:, 0])
+    # Each view is searched as a frame of its own, until the best strips of each picture are chosen.
+    count = views.shape[1]
+    unlike, around, well_inside, tones = (
+        views.flatten(0, 1),
+        *(layer.repeat_interleave(count, 0) for layer in (seen, well_inside, tone)),
+    )
     ridge, edges = _edges(unlike, well_inside)
-    votes = hough.vote(edges, images.shape[0], canvas.half_diagonal_px / canvas.factor + 2)
+    votes = hough.vote(edges, len(unlike), canvas.half_diagonal_px / canvas.factor + 2)
     lines = hough.refine(edges, hough.peaks(votes, _LINES))
-    picture = strips.SmallPicture(torch.stack([unlike, seen.to(unlike.dtype), tone]), canvas, images.shape[-1])
+    layers = torch.stack([unlike, around.to(unlike.dtype), tones])
+    picture = strips.SmallPicture(layers, count, canvas, images.shape[-1])
     lines = hough.HoughLines(lines.normal, lines.rho * canvas.factor, lines.votes)
     # Masks have no texture: a strip that is too wide looks as good at a glance as the right one, so none is left out.
     count_pairs = _STRIPS if masks is None else _PAIRS
     pairs = scoring.screen(picture, strips.pair(lines, picture, settings, _PAIRS), settings, count_pairs)
     evidence = scoring.inspect(picture, pairs, settings)
     scores = scoring.score(evidence, settings)
-    index, best = scoring.distinct(evidence, scores, count)
+    found = _best(picture, evidence, scores, settings, wanted)
+    ridge, votes = ridge.unflatten(0, (-1, count)).any(1), votes.unflatten(0, (-1, count)).amax(1)
+    lines = hough.HoughLines(**{n: v.unflatten(0, (-1, count)).flatten(1, 2) for n, v in vars(lines).items()})
+    evidence, scores = evidence.views_together(count), scores.unflatten(0, (-1, count)).flatten(1, 2)
+    drawn = (rgb, seen, views[:, 0], views[:, -1], ridge, votes, lines, evidence, scores, canvas.factor, canvas.origin)
+    return found, Stages(*drawn)
+
+
+def _best(
+    picture: strips.SmallPicture,
+    evidence: scoring.Evidence,
+    scores: Float[Tensor, "v k"],
+    settings: DetectorSettings,
+    wanted: int,
+) -> Found:
+    """The best strips of each view, traced; and of these the best of each picture, traced once more.
+
+    A strip of one view that lies on one of another competes by how straight its contours are.
+    """
+    index, best = scoring.distinct(evidence, scores, wanted)
+    few = evidence.pick(index).views_together(picture.views)
+    best = best.reshape(-1, picture.views * wanted)
     keep = best > 0
     keep[0, 0] |= ~keep.any()  # an empty list would have no medians
-    traced = trace.trace(picture, evidence.strips.pick(index).listed(keep), settings)
+    straight, wander = trace.straighten(trace.trace(picture, few.strips.listed(keep), settings))
+    merit = torch.zeros_like(best)
+    merit[keep] = best[keep] / (1 + (wander / (0.02 * few.width[keep] + picture.factor)).square())[0]
+    merit = torch.where(few.strips.frame % picture.views > 0, _LIT_MERIT * merit, merit)
+    index, best = scoring.distinct(few, merit, wanted)
+    place = torch.zeros_like(keep, dtype=torch.int64)
+    place[keep] = torch.arange(straight.frame.shape[1], device=place.device)
+    chosen = best > 0
+    chosen[0, 0] |= ~chosen.any()
+    listed = straight.pick(place.gather(1, index)[chosen][None])
     # Once more around lines through what was traced: the pair of Hough lines may have followed a short stretch only.
-    traced = trace.trace(picture, trace.straighten(traced), settings)
-    return Found(traced, keep, best), Stages(
-        rgb, seen, unlike, ridge, votes, lines, evidence, scores, canvas.factor, canvas.origin
-    )
+    return Found(trace.trace(picture, listed, settings), listed.frame // picture.views, chosen, best)
 
 
 def _lay_out(

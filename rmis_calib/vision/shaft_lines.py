@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rmis_calib.errors import ShapeError
 from rmis_calib.geometry import Camera, axis_from_contours, plane_normal_from_points
-from rmis_calib.vision import edges, ends
+from rmis_calib.vision import confidence, edges, ends
 from rmis_calib.vision.canvas import Canvas, plan_canvas
 from rmis_calib.vision.lens import Lens
 from rmis_calib.vision.linefit import LineFit, fit_lines
@@ -24,9 +24,6 @@ from rmis_calib.vision.strips import Strips
 from rmis_calib.vision.trace import Trace
 
 _POLYLINE = 24
-# Logistic curve from the product of marks to the share of right candidates, on 416 rendered and 80 real ones: 2 % right
-# below a mark of 0.2, half at 0.4 to 0.5, all above 0.8.
-_MARK_SLOPE, _EVEN_MARK = 9.0, 0.42
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,19 +143,20 @@ class ShaftDetector:
         """Sub-pixel contours, axis and end of the traced strips."""
         trace, keep, scores = found.trace, found.keep, found.scores
         decoded = images.contiguous(memory_format=torch.channels_last)  # a copy only of planar pictures
-        picture = FullPicture(decoded, trace.strips.frame, self.lens)
+        picture = FullPicture(decoded, found.frame, self.lens)
         points, fit = self._contours(picture, trace)
         strips = replace(trace.strips, offset=fit.offset, slope=fit.slope)
         floor = 5 * self.settings.sigma_floor_px
         end = ends.locate(picture, strips, trace.end, trace.width, points.blur_px.mean(-1), floor)
         offered = edges.at_stations(trace.sides, trace.t, points.t)
         share = (fit.inliers / offered.sum(-1).clamp(min=1)).amin(-1)
-        confidence = _confidence(trace, fit, share, math.hypot(*images.shape[-2:]))
+        certain = confidence.chance(confidence.marks(trace, fit, points, share))
         convergence = (fit.slope[..., 0] - fit.slope[..., 1]).abs()
         cylinder = convergence < math.tan(math.radians(self.settings.max_convergence_deg))
         clear = cylinder & (share > 0.15) & ((scores > 0) & ~broken[:, None])[keep] & (fit.spread_t.amin(-1) > 0)
-        valid = clear & (confidence >= self.settings.min_confidence)
-        measured = self._assemble(trace, strips, points, fit, end, valid, confidence)
+        plausible = confidence.plausible(trace, fit, share, math.hypot(*images.shape[-2:]))
+        valid = clear & plausible & (certain >= self.settings.min_confidence)
+        measured = self._assemble(trace, strips, points, fit, end, valid, certain)
         reason = _reason(stages, scores, _spread(clear, keep), _spread(valid, keep), broken)
         fields = {name: _spread(value, keep) for name, value in measured.items()}
         dense = ShaftDetections(reason=reason, **fields)
@@ -192,7 +190,7 @@ class ShaftDetector:
         fit: LineFit,
         end: ends.ShaftEnd,
         valid: Bool[Tensor, "b k"],
-        confidence: Float[Tensor, "b k"],
+        certain: Float[Tensor, "b k"],
     ) -> dict[str, Tensor]:
         """The fields of `ShaftDetections`, but for the reason."""
         focal = self.lens.focal_px
@@ -219,7 +217,7 @@ class ShaftDetector:
             end_sigma=_only(end_valid, end.sigma_px / focal),
             end_valid=end_valid,
             direction_known=known & valid,
-            confidence=_only(valid, confidence),
+            confidence=_only(valid, certain),
             contour_uv=_only(valid, self.lens.to_raw(polyline)),
             end_uv=_only(end_valid, self.lens.to_raw(end_ideal)),
             scatter_px=_only(valid, fit.scatter_px),
@@ -265,19 +263,6 @@ def _axis(
     depth, shift = (ray * plane.camera_u).sum(-1), (ray * along).sum(-1)
     on_axis = plane.camera_u * depth[..., None] + along * (shift * (1 - plane.half_angle_rad.sin()))[..., None]
     return axis, on_axis[..., :2] / on_axis[..., 2:]
-
-
-def _confidence(trace: Trace, fit: LineFit, share: Float[Tensor, "b k"], reach_px: float) -> Float[Tensor, "b k"]:
-    """Chance that this is a shaft with both contours right, from contrast, length, agreement of the points, border."""
-    contrast = trace.contrast / (trace.contrast + 0.08)
-    length = 1 - torch.exp(-1.2 * trace.length / trace.width.clamp(min=1.0))
-    # Contours of a cavity wander by a twentieth of its width and more; those of a shaft out of focus by half of that.
-    agreement = 1 / (1 + (fit.scatter_px.amax(-1) / (1.0 + 0.035 * trace.width)) ** 4)
-    border = torch.where(trace.start_at_border, 1.0, 0.45)
-    # A short dark bar at the border may be anything; a long one is rarely furniture.
-    size = 1 - torch.exp(-trace.length / (0.12 * reach_px))
-    mark = contrast * length * agreement * border * size * (share / 0.6).clamp(max=1.0)
-    return torch.sigmoid(_MARK_SLOPE * (mark - _EVEN_MARK))
 
 
 def _reason(stages: Stages, scores: Tensor, clear: Tensor, valid: Tensor, broken: Tensor) -> Int[Tensor, " b"]:

@@ -17,6 +17,9 @@ _TONE_FLOOR = 0.06
 # Weight of the tint against log brightness: slate-grey shafts on dark liver are up to 0.2 brighter in log brightness
 # and 0.3 less tinted, so the tint must weigh at least 1; at 2 both real sets separate (tests/benchmarks).
 _TINT_WEIGHT = 2.0
+_LIT_TINT_WEIGHT = 3.0
+# Below the scene's median log brightness: a cavity's depth gets a third of the light of tissue, and less.
+_CAVITY_DARKER = 1.0
 _BORDER_ROWS = 24
 _BLUR_PX = 1.4
 _BELL = [math.exp(-0.5 * (shift / _BLUR_PX) ** 2) for shift in range(5)]
@@ -45,14 +48,29 @@ def scene_tint(rgb: Float[Tensor, "b 3 h w"], seen: Bool[Tensor, "b h w"]) -> Fl
 
 def unlikeness(
     rgb: Float[Tensor, "b 3 h w"], seen: Bool[Tensor, "b h w"]
-) -> tuple[Float[Tensor, "b h w"], Float[Tensor, "b h w"]]:
-    """Low on a dark neutral shaft, higher on everything around it: log brightness plus the scene's tint.
+) -> tuple[Float[Tensor, "b views h w"], Float[Tensor, "b h w"]]:
+    """Two views of the picture, low on a shaft and higher beside it.
+
+    The dark view, log brightness plus the scene's tint, is low on dark neutral shafts; a step of 0.1 is a tenth in
+    brightness. The lit view is low on neutral shafts of any brightness, and high where it is too dark for a shaft in
+    this light: a shaft with a stripe of glare, or before a cavity, has no steady contours in the dark view.
 
     Returns:
-        the sum, in which a step of 0.1 is a tenth in brightness, and log brightness alone, both smoothed.
+        both views, and log brightness alone, all smoothed.
     """
     tone = smooth(rgb.amax(1).add_(_TONE_FLOOR).log_())
-    return smooth(scene_tint(rgb, seen)).mul_(_TINT_WEIGHT).add_(tone), tone
+    tint = smooth(scene_tint(rgb, seen))
+    usual = torch.where(seen, tone, torch.nan)[:, ::4, ::4].flatten(1).nanmedian(1).values
+    cavity = (torch.nan_to_num(usual)[:, None, None] - _CAVITY_DARKER - tone).clamp_(min=0.0)
+    return torch.stack([tone + _TINT_WEIGHT * tint, cavity.add_(tint, alpha=_LIT_TINT_WEIGHT)], 1), tone
+
+
+def weighted_tint(
+    unlike: Float[Tensor, "b k *s"], tone: Float[Tensor, "b k *s"], lit: Bool[Tensor, "b k"]
+) -> Float[Tensor, "b k *s"]:
+    """The tint as it enters the dark view, read back from either view (from the lit one only where it is no cavity)."""
+    lit = lit.reshape(*lit.shape, *[1] * (unlike.ndim - 2))
+    return torch.where(lit, unlike * (_TINT_WEIGHT / _LIT_TINT_WEIGHT), unlike - tone)
 
 
 def smooth(picture: Float[Tensor, "b h w"]) -> Float[Tensor, "b h w"]:

@@ -9,13 +9,14 @@ from rmis_calib.vision.search import Stages
 from rmis_calib.vision.shaft_lines import ShaftDetections
 from rmis_calib.vision.stages import draw_stages
 
-_PANEL_WIDTH, _COLUMNS, _GAP, _TITLE, _HEADER = 480, 4, 12, 50, 58
+_PANEL_WIDTH, _COLUMNS, _GAP, _TITLE, _HEADER = 480, 5, 12, 50, 58
 _PAPER, _INK, _FAINT, _MARK = (22, 24, 29), (240, 240, 240), (160, 165, 175), (255, 176, 0)
 
 _TITLES = {
     "1_small": ("1 small picture", "shrunken, lens distortion taken out"),
     "2_field_of_view": ("2 field of view", "purple is outside and not looked at"),
-    "3_unlike_a_shaft": ("3 unlike a shaft", "dark: dark and untinted, or in a mask of yours"),
+    "3_unlike_a_shaft": ("3 unlike a dark shaft", "dark: dark and untinted, or in a mask of yours"),
+    "3_unlike_a_shaft_lit": ("3 unlike a lit shaft", "dark: untinted at any brightness, and no cavity"),
     "4_ridges": ("4 edges", "red: pixels that may vote for a line"),
     "5_votes": ("5 votes", "angle down, distance across; bright: a line"),
     "6_lines": ("6 lines", "the most voted; a tick points outwards"),

@@ -30,6 +30,7 @@ def draw_stages(stages: Stages, frame: int = 0) -> dict[str, np.ndarray]:
         "1_small": small,
         "2_field_of_view": field,
         "3_unlike_a_shaft": unlike,
+        "3_unlike_a_shaft_lit": _heat(stages.lit[frame], stages.seen[frame]),
         "4_ridges": ridges,
         "5_votes": votes,
         "6_lines": _lines(small.copy(), stages, frame),

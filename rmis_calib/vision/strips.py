@@ -21,7 +21,10 @@ class SmallPicture:
     """The small picture of a batch, and how to read it at full-resolution ideal pixels."""
 
     layers: Float[Tensor, "3 b h w"]
-    """Unlikeness to a shaft; 1 inside the field of view, else 0; log brightness."""
+    """Unlikeness to a shaft; 1 inside the field of view, else 0; log brightness. The views of a picture follow one
+    another as frames of their own."""
+    views: int
+    """How many: the dark one, or the dark and the lit one."""
     canvas: Canvas
     width_px: int
     """Width of the raw picture."""
@@ -35,6 +38,10 @@ class SmallPicture:
     def half_diagonal_px(self) -> float:
         """Reach of a line from the middle, full-resolution px."""
         return self.canvas.half_diagonal_px
+
+    def lit(self, strips: "Strips") -> Bool[Tensor, "b k"]:
+        """Which strips are seen in the lit view."""
+        return strips.frame % self.views > 0
 
     def read(
         self, strips: "Strips", t: Float[Tensor, "b k *#points"], y: Float[Tensor, "b k *#points"]

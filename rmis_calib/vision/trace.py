@@ -27,7 +27,9 @@ from rmis_calib.vision.runs import (
 )
 from rmis_calib.vision.scoring import MAX_BRIGHTER
 from rmis_calib.vision.settings import DetectorSettings
+from rmis_calib.vision.shaft_mask import weighted_tint
 from rmis_calib.vision.strips import SmallPicture, Strips
+from rmis_calib.vision.wrists import between_wrists
 
 _STATIONS = 160
 _OFFSETS = 9
@@ -36,6 +38,9 @@ _OFFSETS = 9
 _TONE_SHARE = 0.38
 _RUN_SHARE = 0.6
 _CONTRAST_SHARE = 0.8
+# Log brightness, with tint, within which the inside is the shaft's own though its contours are not seen: half of what
+# tells blood and tissue from it.
+_SAME_TONE = 0.35
 # Largest change of tone over three stations of a plain shaft; its screws and jaws change by more.
 _RUN_UNEVENNESS = 0.45
 
@@ -105,6 +110,7 @@ class _Middle:
     inner: Float[Tensor, "b k s"]
     far: Float[Tensor, "b k s"]
     brightness: Float[Tensor, "b k s"]
+    tint: Float[Tensor, "b k s"]
     seen: Bool[Tensor, "b k s"]
 
 
@@ -115,9 +121,10 @@ def _read_middle(picture: SmallPicture, strips: Strips, stations: Float[Tensor, 
     y = 0.5 * (left + right)[:, :, None] + (left - right)[:, :, None] * across
     value, seen, tone = picture.read(strips, stations[:, :, None], y)
     # The third darkest of seven: a glare stripe may cover half of the width and more.
-    inner, brightness = (third_lowest(layer[:, :, :7]) for layer in (value, tone))
+    tint = weighted_tint(value, tone, picture.lit(strips))
+    inner, brightness, tint = (third_lowest(layer[:, :, :7]) for layer in (value, tone, tint))
     far = torch.where(seen[:, :, 7:], value[:, :, 7:], torch.inf).amin(2)
-    return _Middle(inner, far, brightness, seen[:, :, 3])
+    return _Middle(inner, far, brightness, tint, seen[:, :, 3])
 
 
 def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> Trace:
@@ -134,12 +141,17 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
     edged &= span > settings.min_width_fraction * picture.width_px
     edged &= middle.brightness - sides.brightness.mean(2) < MAX_BRIGHTER
     edged &= (step > settings.min_contrast) & (middle.inner < outer - 0.5 * settings.min_contrast)
+    begins, ends = (at * spacing + t[0] for at in _plain_stretch(middle, sides, edged, span / spacing))
+    before = (t >= begins[..., None]) & (t <= ends[..., None])
+    edged, possible = edged & before, middle.seen & before
     surround = masked_median(torch.where(edged, outer, 0.0) - middle.inner, edged)
     on = edged & _own_tone(middle.inner, outer, edged, edged)
     width = masked_median(span, on & sides.seen.all(2))
     on &= run_lengths(on) * spacing > (0.4 * width).clamp(min=2.5 * spacing)[..., None]
     main = longest_run(on, 0.7 * width / spacing)
-    to_border, borders = _enter(t, edged, main, middle.seen, width)
+    joined = _joined(t, middle.brightness + middle.tint, edged, on, main, possible, width)
+    on, main = on | joined, main | joined
+    to_border, borders = _enter(t, edged | joined, main, middle.seen, width)
     on, main = on | to_border, main | to_border
     line = strips.contour(stations)
     wander = smooth_over(sides.lateral - line, (on[:, :, None] & sides.seen))
@@ -150,10 +162,10 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
         t=t,
         main=main,
         on=on,
-        sides=on[:, :, None] & sides.seen,
+        sides=on[:, :, None] & sides.seen & (sides.rise > settings.min_contrast),
         lateral=line + wander,
         start=first_on(t, on),
-        end=last_on(t, carries_end | up),
+        end=torch.where(torch.isfinite(ends), ends, last_on(t, carries_end | up)),
         start_at_border=borders[0],
         end_at_border=borders[1],
         width=width,
@@ -161,7 +173,49 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
         contrast=masked_median(torch.where(torch.isfinite(step), step, 0.0), on),
         surround=surround,
     )
-    return _towards_tip(whole, first_on(t, carries_end | down), last_on(t, on), t, middle.seen)
+    low_end = torch.where(torch.isfinite(begins), begins, first_on(t, carries_end | down))
+    return _towards_tip(whole, low_end, last_on(t, on), t, middle.seen)
+
+
+def _plain_stretch(
+    middle: _Middle, sides: _Sides, edged: Bool[Tensor, "b k s"], span: Float[Tensor, "b k s"]
+) -> tuple[Float[Tensor, "b k"], Float[Tensor, "b k"]]:
+    """First and last station before a wrist; infinite where there is none, or nothing is left before it.
+
+    Of a shaft that hardly enters the picture the wrist shows more than the shaft does: then it has to serve.
+    """
+    width = masked_median(span, edged)
+    begins, ends = between_wrists(middle.brightness, middle.tint, sides.brightness, edged, middle.seen, width)
+    place = torch.arange(edged.shape[-1], device=edged.device)
+    before = (place >= begins[..., None]) & (place <= ends[..., None])
+    enough = (edged & before & sides.seen.all(2)).sum(-1) > width
+    return torch.where(enough, begins, -torch.inf), torch.where(enough, ends, torch.inf)
+
+
+def _joined(
+    t: Float[Tensor, " s"],
+    inner: Float[Tensor, "b k s"],
+    edged: Bool[Tensor, "b k s"],
+    on: Bool[Tensor, "b k s"],
+    main: Bool[Tensor, "b k s"],
+    possible: Bool[Tensor, "b k s"],
+    width: Float[Tensor, "b k"],
+) -> Bool[Tensor, "b k s"]:
+    """Stations between contoured stretches, or between one and the border, at which the inside keeps its tone.
+
+    A dark cavity behind a shaft, or a film of blood on it, takes its contours away and not the shaft.
+    """
+    step = t[1] - t[0]
+    level = masked_median(inner, edged)[..., None]
+    same = possible & ((inner - level).abs() < _SAME_TONE)
+    run = run_any(bridge(on | same, 0.5 * width / step) & possible, main)
+    reach = 0.5 * width + 3 * step
+    low = first_on(t, run) - first_on(t, possible) < reach
+    high = last_on(t, possible) - last_on(t, run) < reach
+    first, last = first_on(t, on & run), last_on(t, on & run)
+    from_low = (low & ~high)[..., None] | (t >= first[..., None])
+    from_high = (high & ~low)[..., None] | (t <= last[..., None])
+    return run & from_low & from_high
 
 
 def _carries_end(
@@ -214,19 +268,16 @@ def _same_tone(
     return reached & same & (distance > 0)
 
 
-def straighten(traced: Trace) -> Strips:
-    """The strips with straight lines through their traced contours."""
-    t = traced.t.expand_as(traced.lateral)
-    weight = traced.sides.to(t.dtype)
-    main = traced.main[:, :, None].expand_as(traced.lateral)
-    line = fit_lines(t, traced.lateral, weight, main, 0.1 * float(traced.t[1] - traced.t[0]))
+def straighten(traced: Trace) -> tuple[Strips, Float[Tensor, "b k"]]:
+    """The strips with straight lines through their traced contours, and how far these wander from them, px."""
+    t, main = traced.t.expand_as(traced.lateral), traced.main[:, :, None].expand_as(traced.lateral)
+    line = fit_lines(t, traced.lateral, traced.sides.to(t.dtype), main, 0.1 * float(traced.t[1] - traced.t[0]))
     sane = (line.inliers > 5) & (line.slope.abs() < 0.2)
     both = sane.all(-1, keepdim=True)
     strips = traced.strips
-    return replace(
-        strips,
-        offset=torch.where(both, line.offset, strips.offset),
-        slope=torch.where(both, line.slope, strips.slope),
+    offset, slope = torch.where(both, line.offset, strips.offset), torch.where(both, line.slope, strips.slope)
+    return replace(strips, offset=offset, slope=slope), torch.where(
+        both[..., 0], line.scatter_px.amax(-1), 0.05 * traced.width
     )
 
 

@@ -48,4 +48,4 @@ def test_a_sheet_names_the_stage_that_failed() -> None:
     amber = (failed == [255, 176, 0]).all(-1)
     assert amber.sum() > 1000
     # The frame lies about the third panel of the first row: a picture of one tone.
-    assert (amber.sum(0) > 100).argmax() > 2 * good.shape[1] // 4 - 10
+    assert (amber.sum(0) > 100).argmax() > 2 * good.shape[1] // 5 - 10

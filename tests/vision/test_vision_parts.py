@@ -15,7 +15,8 @@ from rmis_calib.vision.hough import EdgePixels, peaks, refine, vote
 from rmis_calib.vision.lens import Lens
 from rmis_calib.vision.linefit import fit_lines
 from rmis_calib.vision.runs import bridge, longest_run, run_lengths
-from rmis_calib.vision.shaft_mask import field_of_view, unlikeness
+from rmis_calib.vision.shaft_mask import field_of_view, unlikeness, weighted_tint
+from rmis_calib.vision.wrists import between_wrists
 
 
 @pytest.mark.parametrize("field", [{"max_shafts": 0}, {"min_contrast": float("nan")}, {"edge_sample": 300}])
@@ -63,8 +64,49 @@ def test_the_field_of_view_ignores_a_black_shaft() -> None:
 def test_unlikeness_is_low_on_the_shaft() -> None:
     bar = draw_bar(0.0, size=(120, 160), width_px=30.0, end_px=400.0)
     rgb = bar.batch.float() / 255
-    unlike, _ = unlikeness(rgb, torch.ones(1, 120, 160, dtype=torch.bool))
-    assert float(unlike[0, 60, 80]) < float(unlike[0, 20, 80]) - 1.0
+    views, _ = unlikeness(rgb, torch.ones(1, 120, 160, dtype=torch.bool))
+    dark, lit = views[0]
+    assert float(dark[60, 80]) < float(dark[20, 80]) - 1.0
+    assert float(lit[60, 80]) < float(lit[20, 80]) - 0.5
+
+
+def test_the_lit_view_sees_glare_as_shaft_and_a_cavity_as_not() -> None:
+    bar = draw_bar(0.0, size=(120, 160), width_px=30.0, end_px=400.0, inside=(90.0, 90.0, 92.0))
+    rgb = bar.batch.float() / 255
+    rgb[:, :, 57:63] = 0.6  # a stripe of glare along the bar
+    rgb[:, :, 90:, :80] = 0.02  # a cavity below its left half
+    views, tone = unlikeness(rgb, torch.ones(1, 120, 160, dtype=torch.bool))
+    (dark, lit), tone = views[0], tone[0]
+    assert float(dark[60, 80]) > float(dark[50, 80]) + 0.3  # the dark view takes the stripe for tissue
+    assert abs(float(lit[60, 80] - lit[50, 80])) < 0.1
+    assert float(lit[110, 40]) > float(lit[70, 40]) + 0.5 and float(dark[110, 40]) < float(dark[70, 40])
+    # Both views give back the same tint.
+    strips = torch.tensor([[False, True]])
+    both = torch.stack([dark[60, 80], lit[60, 80]])[None]
+    tint = weighted_tint(both, tone[60, 80].expand(1, 2), strips)
+    torch.testing.assert_close(tint[0, 0], tint[0, 1], atol=1e-5, rtol=0)
+
+
+def test_a_wrist_is_where_the_inside_alone_becomes_brighter_and_stays_grey() -> None:
+    on = torch.ones(1, 1, 60, dtype=torch.bool)
+    dark = torch.full((1, 1, 60), -1.5)
+    tint, beside = torch.zeros_like(dark), torch.full((1, 1, 2, 60), -0.5)
+    width = torch.tensor([[10.0]])
+    wrist = dark.clone()
+    wrist[..., 40:52] = -0.6
+    seen = torch.ones_like(on)
+    on[..., 52:] = False
+    begin, end = between_wrists(wrist, tint, beside, on, seen, width)
+    assert float(begin) == -math.inf
+    assert abs(float(end) - 39.5) < 2.0  # a fifth of a width: sharp enough for the search at full resolution
+    red = tint.clone()
+    red[..., 40:52] = 0.8  # a ball on the shaft is as bright, and red
+    lamp = beside.clone()
+    lamp[..., 40:52] = 0.4  # towards the light both sides grow brighter too
+    patch = dark.clone()
+    patch[..., 30:33] = -0.6  # a drop shines
+    for brightness, colour, sides in ((wrist, red, beside), (wrist, tint, lamp), (patch, tint, beside)):
+        assert float(between_wrists(brightness, colour, sides, on, seen, width)[1]) == math.inf
 
 
 def test_votes_find_a_line_and_its_outer_side() -> None:
