@@ -137,7 +137,7 @@ def axis_from_contours(
 
 def _join(xy_a: Float[Tensor, "*#batch 2"], xy_b: Float[Tensor, "*#batch 2"]) -> Float[Tensor, "*#batch 3"]:
     # (xa, ya, 1) x (xb, yb, 1) with the difference of the points taken first: no cancellation where they are close.
-    xa, ya = torch.broadcast_to(xy_a, torch.broadcast_shapes(xy_a.shape, xy_b.shape)).unbind(-1)
+    xa, ya = torch.broadcast_tensors(xy_a, xy_b)[0].unbind(-1)
     dx, dy = (xy_b - xy_a).unbind(-1)
     return torch.stack([-dy, dx, xa * dy - ya * dx], dim=-1)
 
