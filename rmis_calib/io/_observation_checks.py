@@ -30,6 +30,11 @@ _UNIT_TOLERANCE = 1e-6
 # An image coordinate of 10 is 84 degrees off axis. Points on a line may be far out, so the median decides.
 _MAX_MEDIAN_COORDINATE = 10.0
 _RADIUS_MM = (0.5, 15.0)
+UNKNOWNS = ("unknown_names", "unknown_displacement", "unknown_at")
+CLOCK = "clock_s"
+"""Name of the clock offset among `unknown_names`."""
+# A second of clock, a radian or a millimetre of a joint: none turns the shaft by more than a turn or moves it by 10 m.
+_MAX_TURN_RAD, _MAX_SHIFT_MM = 6.3, 1e4
 
 Arrays = dict[str, Any]
 
@@ -51,6 +56,7 @@ def canonical(given: Arrays) -> Arrays:
         if side == "right" or any(f"{kind}_{side}" in arrays for kind in _MEASURED):
             valid = _flags(f"valid_{side}", given.get(f"valid_{side}"), n) & known
             arrays[f"valid_{side}"] = _mask_side(arrays, side, valid)
+    arrays |= _unknowns(given, n)
     _check_kinematics(arrays)
     for side in _SIDES:
         _check_image(arrays, side)
@@ -161,6 +167,36 @@ def _extrinsics(value: Any) -> np.ndarray:
     if 0 < baseline_mm < 0.1:
         raise ObservationsError(METRES, where=name, expected="a baseline in mm", found=f"{baseline_mm:g}")
     return array
+
+
+def _unknowns(given: Arrays, n: int) -> Arrays:
+    """The three arrays about offsets of joints and clock, or none."""
+    present = [name for name in UNKNOWNS if name in given]
+    if not present:
+        return {}
+    for other in UNKNOWNS:
+        _need(given, present[0], other)
+    names = _as_array("unknown_names", given["unknown_names"])
+    if names.ndim != 1 or names.dtype.kind != "U" or len(names) == 0 or len(set(names.tolist())) < len(names):
+        found = f"shape {names.shape}, dtype {names.dtype}"
+        raise ObservationsError(where="unknown_names", expected="different names in one row", found=found)
+    for name in names.tolist():
+        if name != CLOCK and not name.endswith(("_rad", "_mm")):
+            expected = f"{CLOCK}, or a joint's name that ends in its unit, _rad or _mm"
+            raise ObservationsError(where="unknown_names", expected=expected, found=repr(name))
+    out: Arrays = {"unknown_names": names.copy()}
+    for name, shape in (("unknown_displacement", (n, len(names), 6)), ("unknown_at", (len(names),))):
+        array = _numbers(name, given[name])
+        if array.shape != shape or np.isnan(array).any():
+            found = array.shape if array.shape != shape else "NaN"
+            raise ObservationsError(where=name, expected=f"finite numbers of shape {shape}", found=found)
+        out[name] = array
+    size = np.abs(out["unknown_displacement"])
+    if size[..., :3].max() > _MAX_TURN_RAD or size[..., 3:].max() > _MAX_SHIFT_MM:
+        found = f"{size[..., :3].max():.3g} and {size[..., 3:].max():.3g}"
+        expected = f"at most {_MAX_TURN_RAD} rad and {_MAX_SHIFT_MM:g} mm a unit (rotation first)"
+        raise ObservationsError(where="unknown_displacement", expected=expected, found=found)
+    return out
 
 
 def _flags(name: str, value: Any, n: int) -> np.ndarray:

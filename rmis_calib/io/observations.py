@@ -57,6 +57,15 @@ class ShaftObservations:
     """(N, 2)."""
     rcm_p_head: np.ndarray | None = None
     """(N, 3), mm."""
+    unknown_names: np.ndarray | None = None
+    """(U,) names of constant offsets of the kinematics that can be estimated: a joint's column (`<arm>.<joint>_rad` or
+    `_mm`) or `clock_s`, in that unit. The three arrays come together."""
+    unknown_displacement: np.ndarray | None = None
+    """(N, U, 6): how a unit of each offset displaces the shaft as a rigid body, in `rcm`: rotation vector, rad, then
+    translation, mm. A change dv of `rcm_v_axis` counts as the rotation v x dv, a change ds of `rcm_s_end_mm` as the
+    translation v ds."""
+    unknown_at: np.ndarray | None = None
+    """(U,) offsets at which the kinematics in this file were evaluated."""
     valid_right: np.ndarray | None = None
     """(N,) bool; after construction always an array."""
     valid_left: np.ndarray | None = None
@@ -153,6 +162,8 @@ class ShaftObservations:
             np.savez(file, **self.to_arrays())  # pyright: ignore[reportArgumentType]
 
 
+CLOCK = checks.CLOCK
+"""Name of the clock offset among `unknown_names`."""
 OBSERVATION_KEYS: tuple[str, ...] = tuple(field.name for field in fields(ShaftObservations))
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from rmis_calib.config import CalibrationConfig
@@ -24,7 +24,7 @@ from rmis_calib.pipeline.estimation import (
     used_motions,
 )
 from rmis_calib.pipeline.evaluation import head_point_errors, summarise_head_points
-from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
+from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns, estimated_offsets
 from rmis_calib.pipeline.next_motion import (
     advice_record,
     camera_view,
@@ -188,8 +188,10 @@ def _solve_choice(
             solution, notes = estimate(observations, config), ()
         else:
             solution, notes = estimate_with_kinematics(observations, config, unknowns, clock_s)
-            poses, known = _at_estimate(unknowns, poses, solution)
+            offsets = estimated_offsets(solution, unknowns.columns, poses.rcm_s_end_mm)
+            poses, known = unknowns.motion_poses(poses.frames, *offsets)
             observations = assemble(recording, poses, views, tuple(c.where(known) for c in choices), config)
+            observations = replace(observations, **unknowns.displacements(*offsets))
     except InsufficientDataError as error:
         motions = _motions(recording, views, poses, choices, None)
         result = _insufficient(config, motions, str(error))
@@ -236,15 +238,6 @@ def _kinematic_unknowns(
     if config.solver.method != "joint" or (asked.joint_offsets == "never" and not asked.clock):
         return None
     return KinematicUnknowns(recording, poses.frames, config.device)
-
-
-def _at_estimate(
-    unknowns: KinematicUnknowns, poses: MotionPoses, solution: Solution
-) -> tuple[MotionPoses, Bool[Tensor, " m"]]:
-    """The poses at the estimated joint and clock offsets, and in which motions the log covers that time."""
-    found = {name: solution.nuisances[name].value for name in ("joint_offset", "clock") if name in solution.nuisances}
-    joint_offset = found.get("joint_offset", poses.rcm_s_end_mm.new_zeros(len(unknowns.columns)))
-    return unknowns.motion_poses(poses.frames, joint_offset, float(found.get("clock", torch.zeros(1))))
 
 
 def _choose_again(run: CalibrationRun) -> tuple[Choice, ...] | None:

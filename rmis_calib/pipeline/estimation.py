@@ -11,7 +11,8 @@ from rmis_calib.errors import CalibrationFailed
 from rmis_calib.geometry.rigid import RigidTransform
 from rmis_calib.io import ShaftObservations
 from rmis_calib.pipeline.device import require_device
-from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
+from rmis_calib.pipeline.file_unknowns import FileUnknowns, file_unknowns
+from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns, estimated_offsets
 from rmis_calib.pipeline.next_motion import advice_record, may_advise, seen_view
 from rmis_calib.pipeline.next_pose import WHERE, pose_candidates
 from rmis_calib.results import STATUS_SENTENCES, CalibrationResult, Motions, Status
@@ -44,25 +45,40 @@ def solve(
     Raises:
         CalibrationFailed: no trustworthy result (with `throw`); its `result` holds what there is.
         InsufficientDataError: too few motions.
+        ObservationsError: something is asked for that the observations do not tell.
     """
     config = config or CalibrationConfig()
     require_device(config.device)
-    solution = estimate(observations, config)
+    unknowns = file_unknowns(observations, config.solver, config.device)
+    if unknowns is None:
+        solution, notes = estimate(observations, config), ()
+    else:
+        solution, notes = estimate_with_kinematics(observations, config, unknowns, unknowns.clock_at_s)
     motions = Motions(*used_motions(solution))
-    result = make_result(solution, motions, residuals_normalised(solution, motions.used), config)
-    result = replace(result, observability=result.observability | _advice(solution, motions, observations, config))
+    residuals, columns = residuals_normalised(solution, motions.used), () if unknowns is None else unknowns.columns
+    result = make_result(solution, motions, residuals, config, columns, notes)
+    advice = _advice(solution, motions, observations, config, unknowns)
+    result = replace(result, observability=result.observability | advice)
     if throw:
         raise_unless_trustworthy(result)
     return result
 
 
 def _advice(
-    solution: Solution, motions: Motions, observations: ShaftObservations, config: CalibrationConfig
+    solution: Solution,
+    motions: Motions,
+    observations: ShaftObservations,
+    config: CalibrationConfig,
+    unknowns: FileUnknowns | None,
 ) -> dict[str, Any]:
     """What motion would help most, as the picture shows it."""
     if not may_advise(solution, config) or not motions.used.any():
         return {}
     problem = problem_of(observations, config).flatten_batch()
+    if unknowns is not None:
+        joint_offset, clock_s = estimated_offsets(solution, unknowns.columns, problem.radius_mm)
+        clock = problem.radius_mm.new_tensor([clock_s])
+        problem = unknowns.linearised(problem, joint_offset[None], clock, torch.zeros_like(joint_offset))
     last = int(np.flatnonzero(motions.used)[-1])
     candidates = pose_candidates(problem, solution, last, config.solver.advice)
     return advice_record(solution, candidates, seen_view(problem), config, WHERE)
@@ -76,7 +92,7 @@ def estimate(observations: ShaftObservations, config: CalibrationConfig) -> Solu
 def estimate_with_kinematics(
     observations: ShaftObservations,
     config: CalibrationConfig,
-    unknowns: KinematicUnknowns,
+    unknowns: KinematicUnknowns | FileUnknowns,
     clock_s: float | None = None,
 ) -> tuple[Solution, tuple[str, ...]]:
     """The same with constant joint offsets, and the clock offset, among the unknowns of `joint`; and what was decided
@@ -97,10 +113,10 @@ def estimate_with_kinematics(
     sigma = unknowns.prior_sigma(asked)
     if asked.joint_offsets == "never":
         sigma = sigma * 0.0
-    if not (asked.clock and unknowns.has_clock):
+    if clock_s is None:
         clock_s = 0.0
-    elif clock_s is None:
-        clock_s = _clock_start(base, unknowns, config.clock_search_s, sigma)
+        if asked.clock and isinstance(unknowns, KinematicUnknowns) and unknowns.has_clock:
+            clock_s = _clock_start(base, unknowns, config.clock_search_s, sigma)
     clock_at = sigma.new_full((1,), clock_s)
 
     def solve_with(sigma: torch.Tensor, rival: Rival | None = None) -> Solution:

@@ -9,9 +9,10 @@ from torch import Tensor
 
 from rmis_calib.geometry.rigid import rigid_inverse
 from rmis_calib.io import Recording
+from rmis_calib.io.observations import CLOCK
 from rmis_calib.kinematics import RobotKinematics
 from rmis_calib.pipeline.poses import MotionPoses
-from rmis_calib.solver import Problem
+from rmis_calib.solver import Problem, Solution
 from rmis_calib.solver.settings import UnknownSettings
 
 _STEP = {"rad": 1e-5, "mm": 1e-3}
@@ -20,6 +21,20 @@ _CONTINUOUS_LOG_S = 0.2
 """A log sampled more slowly is a list of poses, in which there is no velocity and so no clock to estimate."""
 _MOVES_MM = 1e-6
 """A joint whose unit step moves the shaft by less than this (the wrist's joints) has no offset that could be seen."""
+
+
+def joint_sigma(columns: tuple[str, ...], moves: Bool[Tensor, " j"], settings: UnknownSettings) -> Float[Tensor, " j"]:
+    """Prior of each joint's offset, rad or mm; zero for a joint that does not move the shaft."""
+    sigma = {"rad": np.deg2rad(settings.joint_offset_sigma_deg), "mm": settings.joint_offset_sigma_mm}
+    values = [sigma[column.rpartition("_")[2]] for column in columns]
+    return torch.where(moves, torch.tensor(values, dtype=torch.float64, device=moves.device), 0.0)
+
+
+def estimated_offsets(solution: Solution, columns: tuple[str, ...], like: Tensor) -> tuple[Float[Tensor, " j"], float]:
+    """Joint offsets (rad or mm) and clock offset (s) of a solution; zero where they were not estimated."""
+    found = {name: nuisance.value.reshape(-1) for name, nuisance in solution.nuisances.items()}
+    joint_offset = found.get("joint_offset", like.new_zeros(len(columns)))
+    return joint_offset, float(found["clock"]) if "clock" in found else 0.0
 
 
 class KinematicUnknowns:
@@ -51,9 +66,7 @@ class KinematicUnknowns:
 
     def prior_sigma(self, settings: UnknownSettings) -> Float[Tensor, " j"]:
         """Prior of each offset, rad or mm; zero for a joint that does not move the shaft."""
-        sigma = {"rad": np.deg2rad(settings.joint_offset_sigma_deg), "mm": settings.joint_offset_sigma_mm}
-        values = [sigma[column.rpartition("_")[2]] for column in self.columns]
-        return torch.where(self.moves_shaft(), torch.tensor(values, dtype=torch.float64, device=self._device), 0.0)
+        return joint_sigma(self.columns, self.moves_shaft(), settings)
 
     def moves_shaft(self) -> Bool[Tensor, " j"]:
         """Which joints move the shaft as the camera sees it; those of the wrist do not."""
@@ -115,6 +128,17 @@ class KinematicUnknowns:
             joint_derivative=derivative,
             clock_derivative=torch.zeros_like(derivative[..., 0]),
         )
+
+    def displacements(self, joint_offset: Float[Tensor, " j"], clock_s: float) -> dict[str, np.ndarray]:
+        """What an observations file says about the offsets, at one set of them: the `unknown_*` arrays."""
+        clock = torch.tensor([clock_s], dtype=torch.float64)
+        derivative = self._derivative(self._readings(clock)[0] + joint_offset)  # (1, m, 6, j)
+        names, at = list(self.columns), [*joint_offset.tolist()]
+        if self.has_clock:
+            derivative = torch.cat((derivative, derivative @ self._velocity(clock)[..., None]), dim=-1)
+            names, at = [*names, CLOCK], [*at, clock_s]
+        displacement = derivative[0].mT.cpu().numpy()
+        return {"unknown_names": np.array(names), "unknown_displacement": displacement, "unknown_at": np.array(at)}
 
     def motion_poses(
         self, frames: np.ndarray, joint_offset: Float[Tensor, " j"], clock_s: float

@@ -16,7 +16,7 @@ from torch import Tensor
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.geometry.cameras import Camera
 from rmis_calib.io import Recording
-from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
+from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns, estimated_offsets
 from rmis_calib.solver import Problem, Solution, SolveStatus
 from rmis_calib.solver.advice import Advice, advise, measured_alike
 from rmis_calib.solver.observability import remedies
@@ -146,9 +146,8 @@ def joint_candidates(
         settings: how far joints may go.
         seed: of the random ones.
     """
-    found = {name: nuisance.value.reshape(-1) for name, nuisance in solution.nuisances.items()}
-    joint_offset = found.get("joint_offset", problem.arm_T_rcm.new_zeros(len(unknowns.columns)))
-    logged = unknowns.readings_of_motions(float(found["clock"]) if "clock" in found else 0.0).cpu().numpy()
+    joint_offset, clock_s = estimated_offsets(solution, unknowns.columns, problem.arm_T_rcm)
+    logged = unknowns.readings_of_motions(clock_s).cpu().numpy()
     low, high = joint_box(recording, unknowns.columns, logged, settings)
     home = logged[np.flatnonzero(used)[-1] if used.any() else -1]
     free = np.flatnonzero(unknowns.moves_shaft().cpu().numpy())

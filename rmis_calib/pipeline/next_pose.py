@@ -78,6 +78,7 @@ def pose_candidates(problem: Problem, solution: Solution, motion: int, settings:
         like,
         arm_T_rcm=poses[None],
         rcm_v_axis=turned_v[None],
+        clock_derivative=None if like.clock_derivative is None else torch.zeros_like(like.clock_derivative),
         rcm_s_end_mm=like.rcm_s_end_mm + slide_mm,
         rcm_p_head=(turn @ problem.rcm_p_head[0, motion] + slide_mm[:, None] * turned_v)[None],
     )

@@ -156,7 +156,7 @@ def _finish(
         prior = with_prior(replace(normal, H=torch.zeros_like(normal.H)), layout, state).H
         delta = _seen_step(normal.H, prior, normal.g - expected.g)
         state, bias = state.moved(layout.step(delta)), -delta
-        information = floored_information(normal.H - prior, expected.H) + prior
+        information = floored_information(normal.H - prior, expected.H, prior) + prior
     sample = slice(None, None, max(1, packed.motions // LONG_SAMPLE))
     weight_all = torch.ones_like(packed.line_ok[0], dtype=packed.p.dtype) if weight is None else weight
     scale = information.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
@@ -197,12 +197,19 @@ def _seen_step(
     return -scale * (vectors @ along[..., None])[..., 0]
 
 
-def floored_information(H: Float[Tensor, "b p p"], expected: Float[Tensor, "b p p"]) -> Float[Tensor, "b p p"]:
+def floored_information(
+    H: Float[Tensor, "b p p"], expected: Float[Tensor, "b p p"], prior: Float[Tensor, "b p p"]
+) -> Float[Tensor, "b p p"]:
     """2 H - E[H], at least INFORMATION_FLOOR of H in every direction.
 
     Noise in the Jacobian inflates H; simulating at the estimate inflates it once more by the same amount (bias.py).
+
+    Args:
+        H: of the data.
+        expected: E[H] of the data.
+        prior: sets the scale of an unknown of which the data know nothing, where H is rounding.
     """
-    scale = H.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
+    scale = (H + prior).diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
     unit = H * scale[:, :, None] * scale[:, None]
     values, vectors = torch.linalg.eigh(torch.nan_to_num(unit))
     root = vectors * values.clamp_min(1e-14).rsqrt()[:, None] @ vectors.mT

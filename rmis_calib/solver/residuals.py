@@ -161,11 +161,16 @@ def camera_poses(packed: Packed, state: State) -> tuple[Float[Tensor, "b c 3 3"]
 
 
 def rcm_axes(packed: Packed) -> tuple[Float[Tensor, "3 b n"], Float[Tensor, "3 b n"]]:
-    """Two unit directions across the shaft, fixed to `rcm`, in `arm`: x of `rcm` made perpendicular to the axis (y
-    where x is nearer to the axis than y), and the axis times it."""
-    x_along, y_along = dot(packed.R[:, 0], packed.v), dot(packed.R[:, 1], packed.v)
-    first = torch.where((x_along.abs() > y_along.abs()), packed.R[:, 1], packed.R[:, 0])
-    e1 = unit(first - dot(first, packed.v) * packed.v)
+    """Two unit directions across the shaft, fixed to `rcm`, in `arm`: the axis of `rcm` that follows the one nearest to
+    the shaft (x, y, z, x) made perpendicular to it, and the shaft times that.
+
+    The offset is one constant only while the choice stays the same: while the shaft keeps within 45 degrees of one
+    axis. (To compare the two axes that lie across the shaft instead changes the choice from motion to motion.)
+    """
+    along = torch.stack([dot(packed.R[:, i], packed.v).abs() for i in range(3)])
+    nearest = along.argmax(0)
+    axis = torch.where(nearest == 2, packed.R[:, 0], torch.where(nearest == 0, packed.R[:, 1], packed.R[:, 2]))
+    e1 = unit(axis - dot(axis, packed.v) * packed.v)
     return e1, cross(packed.v, e1)
 
 

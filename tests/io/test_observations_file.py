@@ -36,6 +36,9 @@ def everything() -> dict[str, Any]:
         "rcm_p_head": 160 + generator.normal(size=(N, 3)),
         "sigma_image": 1e-3,
         "sigma_edge_bias": 3e-5,
+        "unknown_names": np.array(["laparoscope.yaw_rad", "instrument.insertion_mm", "clock_s"]),
+        "unknown_displacement": generator.normal(size=(N, 3, 6)),
+        "unknown_at": np.array([0.001, 0.1, 0.02]),
     }
     levels = [f"sigma_{what}_{unit}" for what in ("kinematics", "camera", "stereo") for unit in ("mm", "rad")]
     arrays |= dict.fromkeys(levels, 0.0)
@@ -193,6 +196,26 @@ BAD = {
     "one edge twice": (
         put("contour_right", 3, [[0.0, 1.0], [2.0, 3.0]]),
         r"contour_right\[3\]: expected two edges that",
+    ),
+    "offsets without names": (
+        lambda arrays: arrays.pop("unknown_names"),
+        "unknown_displacement: expected unknown_names beside it, found none",
+    ),
+    "an offset without a unit": (
+        replace("unknown_names", np.array(["yaw", "instrument.insertion_mm", "clock_s"])),
+        "unknown_names: expected clock_s, or a joint's name that ends in its unit, _rad or _mm, found 'yaw'",
+    ),
+    "an offset named twice": (
+        replace("unknown_names", np.array(["clock_s", "instrument.insertion_mm", "clock_s"])),
+        "unknown_names: expected different names in one row",
+    ),
+    "displacements of other offsets": (
+        replace("unknown_displacement", np.zeros((N, 2, 6))),
+        r"unknown_displacement: expected finite numbers of shape \(6, 3, 6\), found \(6, 2, 6\)",
+    ),
+    "displacements in degrees": (
+        replace("unknown_displacement", np.full((N, 3, 6), 57.3)),
+        "unknown_displacement: expected at most 6.3 rad and 10000 mm a unit",
     ),
     "pixels": (scale("axis_right", 800.0), "axis_right: looks like pixels; expected normalised x/z, y/z"),
     "negative sigma": (

@@ -1,0 +1,105 @@
+"""Joint offsets and the clock as unknowns of an observations file, which knows their effect to first order only.
+
+The file says where the shaft is at one set of offsets and how a unit of each displaces it. Further away the
+displacement is taken as proportional: within half a degree and a millimetre a joint that is wrong by micrometres.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rmis_calib.errors import ObservationsError
+from rmis_calib.geometry.rigid import rigid_exp
+from rmis_calib.io import ShaftObservations
+from rmis_calib.io.observations import CLOCK
+from rmis_calib.pipeline.kinematic_unknowns import joint_sigma
+from rmis_calib.solver import Problem
+from rmis_calib.solver.settings import SolverSettings, UnknownSettings
+
+_MOVES = {"rad": 1e-4, "mm": 1e-6}
+"""Displacement a unit below which a joint does not move the shaft."""
+
+
+class FileUnknowns:
+    """Poses of the motions at joint offsets and a clock offset, to first order, with their derivatives."""
+
+    def __init__(self, observations: ShaftObservations, device: str) -> None:
+        """Keep the displacements.
+
+        Raises:
+            ObservationsError: the observations tell none.
+        """
+        if observations.unknown_names is None or observations.unknown_displacement is None:
+            raise ObservationsError(where="unknown_displacement", expected="effects of offsets", found="none")
+        names = observations.unknown_names.tolist()
+        joints = [index for index, name in enumerate(names) if name != CLOCK]
+        effect = torch.as_tensor(observations.unknown_displacement, device=device).mT  # (m, 6, u)
+        at = torch.as_tensor(observations.unknown_at, device=device)
+        self.columns = tuple(names[index] for index in joints)
+        """`<arm>.<joint>_rad` or `_mm`, as in the file."""
+        self.has_clock = CLOCK in names
+        """Whether the file tells the effect of a clock offset."""
+        self.clock_at_s = float(at[names.index(CLOCK)]) if self.has_clock else 0.0
+        """Clock offset at which the file's kinematics were evaluated."""
+        self._joint, self._joint_at = effect[..., joints], at[joints]
+        self._clock = effect[..., names.index(CLOCK)] if self.has_clock else torch.zeros_like(effect[..., 0])
+
+    def prior_sigma(self, settings: UnknownSettings) -> Float[Tensor, " j"]:
+        """Prior of each offset, rad or mm; zero for a joint that does not move the shaft."""
+        least = [_MOVES[column.rpartition("_")[2]] for column in self.columns]
+        moves = self._joint.abs().amax(dim=(0, 1)) > self._joint.new_tensor(least)
+        return joint_sigma(self.columns, moves, settings)
+
+    def at(self, base: Problem, joint_offset: Float[Tensor, "b j"], clock_s: Float[Tensor, " b"]) -> Problem:
+        """The measurements of `base` with the shaft displaced as `b` sets of offsets say.
+
+        Args:
+            base: one trial axis of length 1, with the file's kinematics.
+            joint_offset: added to the readings, rad or mm.
+            clock_s: added to the times at which the joints are read.
+        """
+        change = joint_offset - self._joint_at
+        displacement = torch.einsum("muj,bj->bmu", self._joint, change)
+        displacement = displacement + self._clock * (clock_s - self.clock_at_s)[:, None, None]
+        repeated = base.take_trials(torch.zeros(len(clock_s), dtype=torch.int64, device=joint_offset.device))
+        return replace(
+            repeated,
+            arm_T_rcm=repeated.arm_T_rcm @ rigid_exp(displacement),
+            joint_offset_at=joint_offset,
+            clock_at=clock_s,
+        )
+
+    def linearised(
+        self,
+        base: Problem,
+        joint_offset: Float[Tensor, "b j"],
+        clock_s: Float[Tensor, " b"],
+        sigma: Float[Tensor, " j"],
+    ) -> Problem:
+        """The same with the derivatives that make the offsets unknowns; `sigma` is the prior of each joint's."""
+        trials = len(clock_s)
+        return replace(
+            self.at(base, joint_offset, clock_s),
+            joint_derivative=self._joint.expand(trials, *self._joint.shape),
+            joint_offset_sigma=sigma.expand(trials, -1),
+            clock_derivative=self._clock.expand(trials, *self._clock.shape) if self.has_clock else None,
+        )
+
+
+def file_unknowns(observations: ShaftObservations, settings: SolverSettings, device: str) -> FileUnknowns | None:
+    """The offsets that are asked for and that the file can tell; None where there are none.
+
+    Raises:
+        ObservationsError: joint offsets are asked for, and the file does not tell their effect.
+    """
+    asked = settings.unknowns
+    names = [] if observations.unknown_names is None else observations.unknown_names.tolist()
+    joints = any(name != CLOCK for name in names)
+    if asked.joint_offsets == "always" and not joints:
+        expected = "unknown_names, unknown_displacement and unknown_at with joints, since joint_offsets is always"
+        raise ObservationsError(where="observations", expected=expected, found=f"{np.array(names).tolist() or 'none'}")
+    wanted = (joints and asked.joint_offsets != "never") or (CLOCK in names and asked.clock)
+    return FileUnknowns(observations, device) if wanted and settings.method == "joint" else None
