@@ -177,7 +177,7 @@ def observability(raw: Mapping[str, Any]) -> Observability:
         tone=_OBSERVABILITY_TONES.get(verdict_word, "open"),
         verdict=verdict_word,
         sentences=_texts(raw.get("sentences")),
-        named_cases=_texts(raw.get("named_cases")),
+        named_cases=tuple(name.replace("_", " ").lower() for name in _texts(raw.get("named_cases"))),
         advice=_texts(raw.get("advice")),
         directions=tuple(_direction(found[index], sigmas[index], low, high) for index in order),
         ticks=tuple((100.0 * (power - low) / (high - low), f"{10.0**power:g}") for power in _decades(low, high)),

@@ -12,7 +12,7 @@ from data_synth.settings import LineStudyConfig
 from rmis_calib.errors import InsufficientDataError, ObservationsError
 from rmis_calib.geometry.rotations import rotation_angle
 from rmis_calib.solver import Problem, SolverSettings, SolveStatus, Verdict, solve
-from rmis_calib.solver.observability import VERDICTS, Degeneracy
+from rmis_calib.solver.observability import VERDICTS, Degeneracy, describe, remedies
 
 REALISTIC = {
     "pixel_noise_px": 0.3,
@@ -120,6 +120,19 @@ def test_short_baseline_is_recognised():
         not int(solve(problem_of(arrays(positions_laparoscope=2), "axis"), method="global").sight.degeneracy[0])
         & Degeneracy.STATIC_LAPAROSCOPE
     )
+
+
+@pytest.mark.parametrize("case", [flag for flag in Degeneracy if flag])
+def test_every_case_is_named_in_words_with_its_remedy(case):
+    """Of a weak answer the sentence says which case it is, and the remedies what would end it."""
+    solution = solve(problem_of(arrays(), "axis", cameras=1), method="global")
+    sight = replace(solution.sight, degeneracy=torch.full_like(solution.sight.degeneracy, int(case)))
+    described = describe(sight, 0)
+    assert described.degeneracies == (case.name,)
+    words = described.sentence.rpartition(": ")[2]
+    assert len(words.split()) >= 5 and "_" not in words
+    (remedy,) = remedies(sight, 0)
+    assert remedy.split()[0] in ("move", "give", "turn", "use", "keep")
 
 
 def test_lines_of_somebody_else_are_not_fitted():
