@@ -8,9 +8,10 @@ from rmis_calib.vision.edges import EdgePoints
 from rmis_calib.vision.linefit import LineFit
 from rmis_calib.vision.trace import Trace
 
-# Fitted as tests/benchmarks/fit_confidence.py does, on nine presets (seeds 1001 to 1006, ten frames each: 930 candidates)
-# and the labelled real frames (92, counted four times). On seeds 2001 to 2004, which no fit saw: of 287 lines above 0.85
-# all are on a shaft and 95 % within three sigma (mean confidence 0.98); between 0.5 and 0.85, 91 % and 47 % of 34 (0.70).
+# Fitted as tests/benchmarks/fit_confidence.py does, on nine presets (seeds 1001 to 1006, ten frames each: 930
+# candidates) and the labelled real frames (92, counted four times). On seeds 2001 to 2004, which no fit saw: of 287
+# lines above 0.85 all are on a shaft and 95 % within three sigma (mean confidence 0.98); of 34 between 0.5 and 0.85,
+# 91 % and 47 % (0.70).
 _BASE = -14.26
 _WEIGHTS = (-2.36, -0.40, 1.82, 1.10, 1.93, 1.02)
 # Product of marks, each 0 to 1: without this gate six strips of the real frames were false and not three.
