@@ -41,8 +41,8 @@ class CalibrationConfig:
     the real recording of the tests the answer is 9.8 mm from the reference, with 0.3 px 3.6 mm, with 0.7 px 2.6 mm."""
     edge_bias_px: float = 0.02
     """Error of a contour point that every picture of a camera shares (lens model, edge detector), 1 sigma, px. It does
-    not average out, so each is an unknown with this prior. 0.02 to 0.04 px were measured on rendered
-    pictures; estimating it takes the demo from 0.084 deg and 0.25 mm off to 0.02 deg and 0.11 mm."""
+    not average out, so each is an unknown with this prior. 0.02 to 0.04 px were measured on rendered pictures;
+    estimating it takes the demo from 0.084 deg and 0.25 mm off to 0.02 deg and 0.11 mm."""
     clock_search_s: float = 3.0
     """With `solver.unknowns.clock`: clock offsets are searched this far to either side of the recording's own. Public
     recordings are off by up to 2.4 s."""

@@ -304,9 +304,7 @@ def result_rows(result: "CalibrationResult") -> list[tuple[str, str]]:
         if residual["median"] is not None:
             rows.append((f"residual, {kind.replace('_', ' ')}", f"median {residual['median']:.3g} {residual['unit']}"))
     for name, nuisance in result.nuisances.items():
-        if name.startswith(
-            "edge_bias"
-        ):  # eight numbers of a hundredth of a pixel; result.json and the report have them
+        if name.startswith("edge_bias"):  # eight hundredths of a pixel: for result.json and the report
             continue
         sigma = "" if nuisance["sigma"] is None else f" +- {nuisance['sigma']:.2g}"
         held = " (held by its prior)" if nuisance.get("held") else ""
