@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int64
+from kornia.filters import spatial_gradient
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -49,14 +50,8 @@ class HoughLines:
 
 
 def gradients(unlike: Float[Tensor, "b h w"]) -> tuple[Float[Tensor, "b h w"], Float[Tensor, "b h w"]]:
-    """Central differences (d/du, d/dv), per pixel, of a picture that is smooth already.
-
-    The same numbers as kornia's `spatial_gradient(mode="diff")`, in a twelfth of its time on two cores.
-    """
-    around = pad(unlike[:, None], (1, 1, 1, 1), mode="replicate")[:, 0]
-    across = around[:, 1:-1, 2:] - around[:, 1:-1, :-2]
-    down = around[:, 2:, 1:-1] - around[:, :-2, 1:-1]
-    return across.mul_(0.5), down.mul_(0.5)
+    """Central differences (d/du, d/dv), per pixel, of a picture that is smooth already."""
+    return spatial_gradient(unlike[None], mode="diff")[0].unbind(1)
 
 
 def thin(
