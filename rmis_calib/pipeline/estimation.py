@@ -27,6 +27,8 @@ COARSE_CLOCK_STEP_S, CLOCK_STEP_S = 0.1, 0.02
 CLEARLY_BETTER = 0.5
 """Part of the disagreement at the recording's own clock below which another clock offset is believed. A camera that
 looks only when the arms rest sees no clock, and its scan has a flat minimum."""
+STRONG_EVIDENCE = 3.0
+"""Log of the odds, 20 to 1, that the data must give for joint offsets to be estimated (Kass & Raftery 1995: strong)."""
 HELD = 1e-3
 """Part of its prior to which an offset is held that the data cannot tell from the transform."""
 TOO_FAR_SIGMA = 4.0
@@ -100,7 +102,7 @@ def estimate_with_kinematics(
 
     An offset that the data cannot tell from the transform (its sigma stays at its prior) is held at zero: its prior
     would else be counted as uncertainty of a transform that absorbs it anyway. With `auto` all offsets are left out
-    when a robot without any explains the data better; the covariance then allows for the other possibility.
+    unless there is strong evidence of them; the covariance then allows for the other possibility.
 
     Args:
         observations: N motions.
@@ -140,7 +142,7 @@ def estimate_with_kinematics(
     belief = offsets.log_odds_nominal.new_tensor(asked.joint_offset_belief)
     probability = torch.sigmoid(torch.logit(belief) - offsets.log_odds_nominal)
     note = _about_offsets(offsets, held, unknowns.columns, float(probability))
-    if asked.joint_offsets == "always" or bool(offsets.log_odds_nominal < 0.0):
+    if asked.joint_offsets == "always" or bool(offsets.log_odds_nominal < -STRONG_EVIDENCE):
         return solution, (note,)
     return solve_with(sigma * 0.0, Rival(solution.camera_right_T_arm, solution.covariance, probability)), (note,)
 

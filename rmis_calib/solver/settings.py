@@ -51,8 +51,8 @@ class UnknownSettings:
     """Prior of each component."""
     joint_offsets: Literal["auto", "always", "never"] = "auto"
     """Estimate constant joint offsets, where the derivatives of the kinematics are in the problem. `calibrate` does so
-    first with `auto`, and leaves them out again where perfect encoders are the more probable explanation: a robot
-    without offsets is calibrated three times more exactly without these unknowns."""
+    first with `auto`, and leaves them out again unless the data are strong evidence of them: a robot without offsets
+    is calibrated three times more exactly without these unknowns."""
     joint_offset_belief: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.8
     """With `auto`: probability, before the data speak, that the encoders have offsets of about their prior. It decides
     how much the covariance allows for offsets that were left out, not the estimate; 0 trusts the encoders."""

@@ -51,7 +51,8 @@ class HoughLines:
 
 def gradients(unlike: Float[Tensor, "b h w"]) -> tuple[Float[Tensor, "b h w"], Float[Tensor, "b h w"]]:
     """Central differences (d/du, d/dv), per pixel, of a picture that is smooth already."""
-    return spatial_gradient(unlike[None], mode="diff")[0].unbind(1)
+    across, down = spatial_gradient(unlike[None], mode="diff")[0].unbind(1)
+    return across, down
 
 
 def thin(

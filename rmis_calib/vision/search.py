@@ -59,22 +59,22 @@ class Found:
 
 
 def search(
-    images: Tensor, canvas: Canvas, settings: DetectorSettings, wanted: int, masks: Tensor | None = None
+    images: Tensor, canvas: Canvas, settings: DetectorSettings, count: int, masks: Tensor | None = None
 ) -> tuple[Found, Stages]:
-    """The best `wanted` strips of each frame with their contours traced, and the stages that led there.
+    """The best strips of each frame, at most `max_shafts`, with their contours traced, and the stages that led there.
 
     Args:
         images: (b, 3, H, W), uint8 or floating point in [0, 1].
         canvas: the small picture's place.
         settings: limits of width, contrast, convergence.
-        wanted: strips a frame.
+        count: views of each picture that are searched, 1 or 2 (shaft_mask.py).
         masks: (b, H, W), 1 on shafts, which replace the colour stage.
     """
     small = shrink(images, canvas.factor)
     field, within = shaft_mask.field_of_view(small, settings.black_level, _RIM_PX)
     rgb, seen, well_inside = _lay_out(canvas, small, field, within)
     if masks is None:
-        views, tone = shaft_mask.unlikeness(rgb, seen)
+        views, tone = shaft_mask.unlikeness(rgb, seen, count)
     else:
         inside = canvas.lay_out(shrink(masks[:, None].to(torch.float32), canvas.factor))
         views, tone = shaft_mask.smooth(1 - inside[:, 0])[:, None], torch.zeros_like(inside[:, 0])
@@ -95,7 +95,7 @@ def search(
     pairs = scoring.screen(picture, strips.pair(lines, picture, settings, _PAIRS), settings, count_pairs)
     evidence = scoring.inspect(picture, pairs, settings)
     scores = scoring.score(evidence, settings)
-    found = _best(picture, evidence, scores, settings, wanted)
+    found = _best(picture, evidence, scores, settings, settings.max_shafts)
     ridge, votes = ridge.unflatten(0, (-1, count)).any(1), votes.unflatten(0, (-1, count)).amax(1)
     lines = hough.HoughLines(**{n: v.unflatten(0, (-1, count)).flatten(1, 2) for n, v in vars(lines).items()})
     evidence, scores = evidence.views_together(count), scores.unflatten(0, (-1, count)).flatten(1, 2)

@@ -96,23 +96,46 @@ class ShaftDetector:
             ShapeError: another shape or dtype, a picture smaller than 64 px, or not of the camera's size; or masks that
                 do not fit the pictures.
         """
-        return self.explain(images, masks)[0]
+        images, masks, broken = self._prepared(images, masks)
+        twice = self.settings.second_look_below
+        if masks is not None or twice == 0:
+            return self._look(images, masks, broken, 1)[0]
+        if twice == 1:
+            return self._look(images, None, broken, 2)[0]
+        found, _ = self._look(images, None, broken, 1)
+        again = ~(found.valid[:, 0] & (found.confidence[:, 0] >= twice))
+        if not bool(again.any()):
+            return found
+        better, _ = self._look(images[again], None, broken[again], 2)
+        for name, value in vars(found).items():
+            value[again] = getattr(better, name)
+        return found
 
     def explain(self, images: Tensor, masks: Tensor | None = None) -> tuple[ShaftDetections, Stages]:
-        """Shafts, and what each stage of the coarse search saw. Arguments and errors as in `detect`."""
+        """Shafts looked for in both views, and what each stage of the coarse search saw. Arguments and errors as in
+        `detect`."""
+        images, masks, broken = self._prepared(images, masks)
+        return self._look(images, masks, broken, 2)
+
+    def _prepared(self, images: Tensor, masks: Tensor | None) -> tuple[Tensor, Tensor | None, Bool[Tensor, " b"]]:
+        """Pictures without infinities, masks that fit them, and which pictures were broken."""
         self._check(images)
         if masks is None and self.segment is not None:
             with torch.no_grad():
                 scale = 1.0 / 255.0 if images.dtype == torch.uint8 else 1.0
                 masks = self.segment(torch.nan_to_num(images.to(torch.float32) * scale))
+        broken = torch.zeros(images.shape[0], dtype=torch.bool, device=images.device)
+        if images.dtype != torch.uint8:
+            broken = ~torch.isfinite(images).flatten(1).all(1)
+            images = torch.nan_to_num(images.to(torch.float32), nan=0.0, posinf=0.0, neginf=0.0)
+        return images, None if masks is None else checked_masks(masks, images), broken
+
+    def _look(
+        self, images: Tensor, masks: Tensor | None, broken: Bool[Tensor, " b"], views: int
+    ) -> tuple[ShaftDetections, Stages]:
+        """Search in one view or two, and sub-pixel measurement."""
         with torch.inference_mode():
-            broken = torch.zeros(images.shape[0], dtype=torch.bool, device=images.device)
-            if images.dtype != torch.uint8:
-                broken = ~torch.isfinite(images).flatten(1).all(1)
-                images = torch.nan_to_num(images.to(torch.float32), nan=0.0, posinf=0.0, neginf=0.0)
-            if masks is not None:
-                masks = checked_masks(masks, images)
-            found, stages = search(images, self._canvas(images), self.settings, self.settings.max_shafts, masks)
+            found, stages = search(images, self._canvas(images), self.settings, views, masks)
             measured = self._measure(images, found, stages, broken)
         # Copied out of inference mode, whose tensors no gradient may be taken with respect to.
         return ShaftDetections(**{name: value.clone() for name, value in vars(measured).items()}), stages

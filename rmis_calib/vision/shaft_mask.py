@@ -44,22 +44,25 @@ def scene_tint(rgb: Float[Tensor, "b 3 h w"], seen: Bool[Tensor, "b h w"]) -> Fl
 
 
 def unlikeness(
-    rgb: Float[Tensor, "b 3 h w"], seen: Bool[Tensor, "b h w"]
+    rgb: Float[Tensor, "b 3 h w"], seen: Bool[Tensor, "b h w"], count: int = 2
 ) -> tuple[Float[Tensor, "b views h w"], Float[Tensor, "b h w"]]:
-    """Two views of the picture, low on a shaft and higher beside it.
+    """One view or two of the picture, low on a shaft and higher beside it.
 
     The dark view, log brightness plus the scene's tint, is low on dark neutral shafts; a step of 0.1 is a tenth in
     brightness. The lit view is low on neutral shafts of any brightness, and high where it is too dark for a shaft in
     this light: a shaft with a stripe of glare, or before a cavity, has no steady contours in the dark view.
 
     Returns:
-        both views, and log brightness alone, all smoothed.
+        `count` views, and log brightness alone, all smoothed.
     """
     tone = smooth(rgb.amax(1).add_(_TONE_FLOOR).log_())
     tint = smooth(scene_tint(rgb, seen))
+    dark = tone + _TINT_WEIGHT * tint
+    if count == 1:
+        return dark[:, None], tone
     usual = torch.where(seen, tone, torch.nan)[:, ::4, ::4].flatten(1).nanmedian(1).values
     cavity = (torch.nan_to_num(usual)[:, None, None] - _CAVITY_DARKER - tone).clamp_(min=0.0)
-    return torch.stack([tone + _TINT_WEIGHT * tint, cavity.add_(tint, alpha=_LIT_TINT_WEIGHT)], 1), tone
+    return torch.stack([dark, cavity.add_(tint, alpha=_LIT_TINT_WEIGHT)], 1), tone
 
 
 def weighted_tint(

@@ -334,9 +334,9 @@ def _towards_tip(
     flip = (high & ~low) | ((high == low) & (high_gap < low_gap))
     turn = flip[..., None]
     lateral = torch.where(turn[..., None], -low_to_high.lateral.flip(2).flip(3), low_to_high.lateral)
-    return Trace(
+    return replace(
+        low_to_high,
         strips=low_to_high.strips.reverse(flip),
-        t=t,
         main=torch.where(turn, low_to_high.main.flip(-1), low_to_high.main),
         on=torch.where(turn, low_to_high.on.flip(-1), low_to_high.on),
         sides=torch.where(turn[..., None], low_to_high.sides.flip(2).flip(3), low_to_high.sides),
@@ -345,8 +345,4 @@ def _towards_tip(
         end=torch.where(flip, -low_end, low_to_high.end),
         start_at_border=torch.where(flip, high, low),
         end_at_border=torch.where(flip, low, high),
-        width=low_to_high.width,
-        length=low_to_high.length,
-        contrast=low_to_high.contrast,
-        surround=low_to_high.surround,
     )

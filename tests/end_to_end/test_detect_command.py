@@ -66,7 +66,7 @@ def test_sheets_of_stages(recording: Path, tmp_path: Path, capsys: pytest.Captur
     assert "1 sheets; 2 frames without a shaft; --debug-frames -1 draws every frame" in capsys.readouterr().out
     assert len(drawn("--debug-frames", "-1")) == 4
     sheet = cv2.imread(str(tmp_path / "out" / "debug" / "right_000001.jpg"))
-    assert sheet.shape[1] == 1980
+    assert sheet.shape[1] == 12 + 5 * (480 + 12)
     amber = (np.abs(sheet.astype(int) - [0, 176, 255]) < 40).all(-1)
     assert amber.sum() > 1000  # the frame about the stage that failed
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from drawn_bars import Bar, draw_bar, tissue
 
-from rmis_calib.vision import ShaftDetector
+from rmis_calib.vision import DetectorSettings, ShaftDetector
 from rmis_calib.vision.confidence import chance
 
 WHITE, BLACK = (255.0, 255.0, 255.0), (0.0, 0.0, 0.0)
@@ -36,6 +36,30 @@ def test_contours_of_a_shaft_with_glare_or_before_a_cavity(angle_deg: float, gla
     error = np.stack([points[0] @ bar.left - bar.width_px / 2, -points[1] @ bar.left - bar.width_px / 2])
     # Measured: 0.06 px at most; a contour that follows the stripe or the cavity's edge is off by 5 px and more.
     assert np.abs(error).max() < 0.15
+
+
+def test_second_look_is_for_pictures_without_a_sure_shaft_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A clear picture beside one without a shaft: each gets what it gets alone, and only the latter is looked at
+    twice."""
+    look, looks = ShaftDetector._look, []
+
+    def counted(self, images, masks, broken, views):
+        looks.append((len(images), views))
+        return look(self, images, masks, broken, views)
+
+    monkeypatch.setattr(ShaftDetector, "_look", counted)
+    empty = torch.from_numpy(tissue(seed=3).copy()).permute(2, 0, 1)[None]
+    batch = torch.cat([draw_bar(20.0).batch, empty])
+    together = ShaftDetector().detect(batch)
+    assert looks == [(2, 1), (1, 2)]
+    for row in range(2):
+        alone = ShaftDetector().detect(batch[row : row + 1])
+        torch.testing.assert_close(together.contour_xy[row], alone.contour_xy[0], equal_nan=True, atol=1e-3, rtol=0.0)
+        assert int(together.reason[row]) == int(alone.reason[0])
+    for below, expected in ((0.0, [(2, 1)]), (1.0, [(2, 2)])):
+        looks.clear()
+        ShaftDetector(DetectorSettings(second_look_below=below)).detect(batch)
+        assert looks == expected
 
 
 def test_confidence_falls_as_contours_wander_soften_and_shrink() -> None:
