@@ -308,5 +308,6 @@ def result_rows(result: "CalibrationResult") -> list[tuple[str, str]]:
             continue
         sigma = "" if nuisance["sigma"] is None else f" +- {nuisance['sigma']:.2g}"
         held = " (held by its prior)" if nuisance.get("held") else ""
-        rows.append((name.replace("_", " "), f"{nuisance['value']:.4g}{sigma} {nuisance['unit']}{held}"))
+        value = 0.0 if abs(nuisance["value"]) < 1e-9 * (nuisance["sigma"] or 0.0) else nuisance["value"]  # rounding
+        rows.append((name.replace("_", " "), f"{value:.4g}{sigma} {nuisance['unit']}{held}"))
     return rows
