@@ -17,7 +17,7 @@ import torch
 
 from rmis_calib.geometry.lines import contour_planes
 from rmis_calib.geometry.rotations import rotvec_to_matrix
-from rmis_calib.solver import Problem, SolverSettings, solve
+from rmis_calib.solver import Problem, SolverSettings, SolveStatus, solve
 from tests.benchmarks.solver_common import (
     KNOWN_RADIUS,
     REALISTIC,
@@ -94,7 +94,9 @@ def main() -> int:
     args = parser.parse_args()
     settings = SolverSettings(unknowns=KNOWN_RADIUS)
     bad = 0
-    print("motions  laparoscope  measurements     cams |  clean deg / mm  | contaminated deg / mm | worst deg | ratio")
+    print(
+        "motions  laparoscope  measurements     cams |  clean deg / mm  | contaminated deg / mm | worst deg | ratio | refused"
+    )
     for laparoscope, instrument in ((3, 4), (2, 3), (1, 5)):
         for kinds in (("axis",), ("contours", "ends")):
             for cameras in (2, 1):
@@ -103,17 +105,20 @@ def main() -> int:
                 trial = study(config(REALISTIC, args.trials, 3, laparoscope, instrument), kinds, cameras)
                 dirty = contaminate(trial, GROSS, SECOND, 5)
                 clean = errors(solve(trial.problem, settings).camera_right_T_arm, trial.truth)
-                e = errors(solve(dirty, settings).camera_right_T_arm, trial.truth)
+                solution = solve(dirty, settings)
+                accepted = (solution.status == SolveStatus.CONVERGED) & (solution.verdict < 2)  # not unobservable
+                e = errors(solution.camera_right_T_arm, trial.truth)[accepted]
                 ratio = max(
                     rms(rotation_deg(e)) / rms(rotation_deg(clean)), rms(translation_mm(e)) / rms(translation_mm(clean))
                 )
-                bad += ratio > 1.5
+                refused = int((~accepted).sum())
+                bad += ratio > 1.5 or refused > 0
                 print(
                     f"{trial.problem.n_motions:7d}  {'moves' if laparoscope > 1 else 'static':11}  "
                     f"{'+'.join(kinds):16} {cameras:4d} | "
                     f"{rms(rotation_deg(clean)):.4f} / {rms(translation_mm(clean)):.4f} | "
                     f"{rms(rotation_deg(e)):8.4f} / {rms(translation_mm(e)):.4f}     | "
-                    f"{float(rotation_deg(e).max()):8.3f}  | {ratio:.2f}",
+                    f"{float(rotation_deg(e).max()):8.3f}  | {ratio:.2f}  | {refused}",
                     flush=True,
                 )
     return 1 if bad else 0
