@@ -95,7 +95,7 @@ def main() -> int:
     settings = SolverSettings(unknowns=KNOWN_RADIUS)
     bad = 0
     print(
-        "motions  laparoscope  measurements     cams |  clean deg / mm  | contaminated deg / mm | worst deg | ratio | refused"
+        "motions  laparoscope  measurements     cams |  clean deg / mm  | outliers, deg / mm | worst deg | ratio | lost"
     )
     for laparoscope, instrument in ((3, 4), (2, 3), (1, 5)):
         for kinds in (("axis",), ("contours", "ends")):
