@@ -42,7 +42,7 @@ class CalibrationConfig:
     edge_bias_px: float = 0.02
     """Error of a contour point that every picture of a camera shares (lens model, edge detector), 1 sigma, px. It does
     not average out, so each is an unknown with this prior. 0.02 to 0.04 px were measured on rendered pictures;
-    estimating it takes the demo from 0.084 deg and 0.25 mm off to 0.02 deg and 0.11 mm."""
+    estimating it took a rendered recording from 0.084 deg and 0.25 mm off to 0.02 deg and 0.11 mm."""
     clock_search_s: float = 3.0
     """With `solver.unknowns.clock`: clock offsets are searched this far to either side of the recording's own. Public
     recordings are off by up to 2.4 s."""

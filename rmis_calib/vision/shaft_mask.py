@@ -27,7 +27,7 @@ def scene_tint(rgb: Float[Tensor, "b 3 h w"], seen: Bool[Tensor, "b h w"]) -> Fl
     """How much of the scene's own colour a pixel has: 0 for grey, up to about 1; half of the chroma for other hues.
 
     Opponent colours over brightness, because noise in a dark shaft must not look like a tint. The same with kornia's
-    Lab found 50 of the 57 labelled real shafts, this 54 (tests/benchmarks/bench_vision_real_frames.py).
+    Lab found 50 of 57 shafts of the real frames where this found 54.
     """
     red, green, blue = rgb.unbind(1)
     # In place wherever it can be: a batch's fresh pages cost more than its sums.
