@@ -59,7 +59,7 @@ class Found:
 
 
 def search(
-    images: Tensor, canvas: Canvas, settings: DetectorSettings, count: int, masks: Tensor | None = None
+    images: Tensor, canvas: Canvas, settings: DetectorSettings, looks: int, masks: Tensor | None = None
 ) -> tuple[Found, Stages]:
     """The best strips of each frame, at most `max_shafts`, with their contours traced, and the stages that led there.
 
@@ -67,14 +67,14 @@ def search(
         images: (b, 3, H, W), uint8 or floating point in [0, 1].
         canvas: the small picture's place.
         settings: limits of width, contrast, convergence.
-        count: views of each picture that are searched, 1 or 2 (shaft_mask.py).
+        looks: views of each picture that are searched, 1 or 2 (shaft_mask.py); masks are a single one.
         masks: (b, H, W), 1 on shafts, which replace the colour stage.
     """
     small = shrink(images, canvas.factor)
     field, within = shaft_mask.field_of_view(small, settings.black_level, _RIM_PX)
     rgb, seen, well_inside = _lay_out(canvas, small, field, within)
     if masks is None:
-        views, tone = shaft_mask.unlikeness(rgb, seen, count)
+        views, tone = shaft_mask.unlikeness(rgb, seen, looks)
     else:
         inside = canvas.lay_out(shrink(masks[:, None].to(torch.float32), canvas.factor))
         views, tone = shaft_mask.smooth(1 - inside[:, 0])[:, None], torch.zeros_like(inside[:, 0])
