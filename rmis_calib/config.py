@@ -95,14 +95,19 @@ def parse_config(raw: dict[str, Any], where: str = "config") -> CalibrationConfi
     try:
         return TypeAdapter(CalibrationConfig).validate_python(raw)
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        if first["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
-            known = _known_keys(first["loc"][:-1])
-            near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
-            hint = f" (did you mean {near[0]}?)" if near else ""
-            raise ConfigError(where=f"{where}: {key}", expected=f"a known key{hint}", found="an unknown one") from None
-        raise ConfigError(where=f"{where}: {key}", expected=first["msg"], found=repr(first["input"])) from None
+        raise config_error(error, where) from None
+
+
+def config_error(error: ValidationError, where: str) -> ConfigError:
+    """The first of pydantic's complaints in our words."""
+    first = error.errors()[0]
+    key = ".".join(str(part) for part in first["loc"])
+    if first["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
+        known = _known_keys(first["loc"][:-1])
+        near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
+        hint = f" (did you mean {near[0]}?)" if near else ""
+        return ConfigError(where=f"{where}: {key}", expected=f"a known key{hint}", found="an unknown one")
+    return ConfigError(where=f"{where}: {key}", expected=first["msg"], found=repr(first["input"]))
 
 
 def load_config(name_or_path: str | Path) -> CalibrationConfig:

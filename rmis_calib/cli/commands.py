@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
+from pydantic import ValidationError
 
 from rmis_calib.cli import EXIT_NOT_TRUSTWORTHY, EXIT_OK
 from rmis_calib.cli.console import ProgressCallback, console, print_advice, print_table, progress_reporter
-from rmis_calib.config import CalibrationConfig, load_config
+from rmis_calib.config import CalibrationConfig, config_error, load_config
 
 if TYPE_CHECKING:
     from rmis_calib.results import CalibrationResult
@@ -20,11 +21,19 @@ Settings = Annotated[CalibrationConfig, tyro.conf.arg(name="")]
 
 
 def parse(class_name: str, command: str, argv: Sequence[str]) -> Any:
-    """The command's arguments; a `--config` file, where given, sets the defaults that flags then override."""
+    """The command's arguments; a `--config` file, where given, sets the defaults that flags then override.
+
+    Raises:
+        ConfigError: a value that no setting may have; names the setting.
+    """
     kind = globals()[class_name]
     config = _config_argument(argv)
     default = kind.defaults(load_config(config)) if config and issubclass(kind, _Estimates) else None
-    return tyro.cli(kind, args=list(argv), prog=f"rmis-calib {command}", default=default, description=kind.__doc__)
+    prog = f"rmis-calib {command}"
+    try:
+        return tyro.cli(kind, args=list(argv), prog=prog, default=default, description=kind.__doc__)
+    except ValidationError as error:  # of the settings as a whole; tyro reports those of single groups itself
+        raise config_error(error, prog) from None
 
 
 def _config_argument(argv: Sequence[str]) -> str | None:

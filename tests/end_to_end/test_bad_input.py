@@ -173,6 +173,11 @@ def test_output_below_a_file_cannot_be_written(recording, tmp_path, capsys):
         (["calibrate", "nowhere", "--out", "o", "--methode", "joint"], "--method"),
         (["calibrate", "nowhere", "--out", "o", "--method", "magic"], "magic"),
         (["calibrate", "nowhere", "--out", "o", "--config", "absent.yaml"], "absent.yaml"),
+        (
+            ["detect", "nowhere", "--out", "o", "--every", "0"],
+            "every: expected Value error, must be at least 1, found 0",
+        ),
+        (["calibrate", "nowhere", "--out", "o", "--edge-bias-px", "-1"], "edge_bias_px"),
         (["solve", "absent.npz", "--out", "o.json"], "absent.npz"),
         (["evaluate", "absent.json", "nowhere"], "absent.json"),
         (["detect", "absent.mp4", "--out", "o"], "absent.mp4"),
