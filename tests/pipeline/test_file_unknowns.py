@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from measured_from_truth import SMALL, observations_from_truth
 
 import data_synth
 import rmis_calib as rc
@@ -18,25 +19,8 @@ from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns, estimated_
 from rmis_calib.pipeline.poses import motion_poses
 from rmis_calib.solver import Problem
 
-SMALL = {"fx_px": 175.0, "fy_px": 175.0, "cx_px": 80.0, "cy_px": 60.0, "distortion": [0.0] * 5}
 CLOCK_S = 0.12
 ALWAYS = parse_config({"clock_search_s": 0.3, "solver": {"unknowns": {"joint_offsets": "always"}}})
-
-
-def measured(path, recording, poses, sigma_px=0.05):
-    """What a detector with this noise would measure, from the recording's truth."""
-    truth = np.load(path / "truth.npz")
-    generator = np.random.default_rng(0)
-    sigma = sigma_px / float(recording.stereo.right.focal)
-    arrays = {f"{kind}_right": truth[f"right_{kind}_xy"][poses.frames] for kind in ("axis", "contour", "end")}
-    return rc.ShaftObservations(
-        arm_T_rcm=poses.arm_T_rcm.numpy(),
-        rcm_v_axis=poses.rcm_v_axis.numpy(),
-        rcm_s_end_mm=poses.rcm_s_end_mm.numpy(),
-        shaft_radius_mm=recording.shaft_diameter_mm / 2,
-        sigma_image=sigma,
-        **{name: value + sigma * generator.standard_normal(value.shape) for name, value in arrays.items()},
-    )
 
 
 @pytest.fixture(scope="module")
@@ -54,10 +38,12 @@ def solved(tmp_path_factory):
     recording = rc.load_recording(folder / "recording", clock_offset_s=0.0)
     poses = motion_poses(recording)
     unknowns = KinematicUnknowns(recording, poses.frames, "cpu")
-    solution, _ = estimate_with_kinematics(measured(folder / "recording", recording, poses), ALWAYS, unknowns)
+    solution, _ = estimate_with_kinematics(
+        observations_from_truth(folder / "recording", recording, poses), ALWAYS, unknowns
+    )
     offsets = estimated_offsets(solution, unknowns.columns, poses.rcm_s_end_mm)
     there, _ = unknowns.motion_poses(poses.frames, *offsets)
-    seen = replace(measured(folder / "recording", recording, there), **unknowns.displacements(*offsets))
+    seen = replace(observations_from_truth(folder / "recording", recording, there), **unknowns.displacements(*offsets))
     seen.save(folder / "observations.npz")
     return solution, rc.ShaftObservations.load(folder / "observations.npz"), unknowns, folder / "recording"
 

@@ -1,9 +1,9 @@
 """Joint and clock offsets: derivatives against finite displacements, and recovery of what the generator put in."""
 
-import numpy as np
 import pytest
 import torch
 import yaml
+from measured_from_truth import SMALL, observations_from_truth
 
 import data_synth
 import rmis_calib as rc
@@ -15,7 +15,6 @@ from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
 from rmis_calib.pipeline.poses import motion_poses
 
 CLOCK_S = 0.72
-SMALL = {"fx_px": 175.0, "fy_px": 175.0, "cx_px": 80.0, "cy_px": 60.0, "distortion": [0.0] * 5}
 
 
 @pytest.fixture(scope="module")
@@ -31,25 +30,6 @@ def moving(tmp_path_factory):
     }
     data_synth.write_recording(path, data_synth.load_synth_config(config))
     return path
-
-
-def observations_from_truth(path, recording, poses, sigma_px=0.05):
-    """What a detector with this noise would measure, from truth.npz."""
-    truth = np.load(path / "truth.npz")
-    generator = np.random.default_rng(0)
-    sigma = sigma_px / float(recording.stereo.right.focal)
-    arrays = {}
-    for key in ("axis", "contour", "end"):
-        values = truth[f"right_{key}_xy"][poses.frames]
-        arrays[f"{key}_right"] = values + sigma * generator.standard_normal(values.shape)
-    return rc.ShaftObservations(
-        arm_T_rcm=poses.arm_T_rcm.numpy(),
-        rcm_v_axis=poses.rcm_v_axis.numpy(),
-        rcm_s_end_mm=poses.rcm_s_end_mm.numpy(),
-        shaft_radius_mm=recording.shaft_diameter_mm / 2,
-        sigma_image=sigma,
-        **arrays,
-    )
 
 
 def test_derivative_is_the_displacement_of_the_shaft(moving):
