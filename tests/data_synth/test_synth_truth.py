@@ -10,6 +10,7 @@ from scipy.special import erf
 
 from data_synth import load_synth_config
 from data_synth.cameras import Camera, build_camera
+from data_synth.contours import view_cylinder
 from data_synth.draw import Brush, draw_instrument
 from data_synth.kinematics import transform_points
 from data_synth.materials import Finish, Surface, own_finish
@@ -152,6 +153,38 @@ def test_contours_smeared_by_motion_stay_where_the_truth_is() -> None:
     assert errors[:, 1].max() > 1.5 * camera.blur_px
     # The fading of the shaft towards its limb counts for more where the edge is wide: measured, at most 0.026 px.
     np.testing.assert_allclose(errors[:, 0], 0.0, atol=0.03)
+
+
+def test_rows_read_one_after_the_other_lean_the_contours() -> None:
+    config = load_synth_config("hard")
+    camera = dataclasses.replace(config.camera, readout_s=0.03, round_field=0.0)
+    motion = dataclasses.replace(config.motion, speed=2.0, frame_rate_hz=2.0)
+    world = build_world(dataclasses.replace(config, camera=camera, motion=motion, motions=8))
+    truth, own = side_truth(world, "right"), world.cameras["right"]
+    leaning = []
+    for i in np.flatnonzero(truth.visible):
+        for edge in range(2):
+            rows = np.sort(truth.contour_uv[i, edge][truth.contour_visible[i, edge]][:, 1])[[0, -1]]
+            row = np.arange(np.ceil(rows[0]), np.floor(rows[1]))
+            if len(row) < 30:
+                continue
+            # Every row shows the contour of its own instant: no point of the shaft is followed here.
+            times = world.frame_times_s[i] + camera.readout_s * ((row + 0.5) / camera.height_px - 0.5)
+            shaft, _ = world.shaft("right", np.full(len(row), i), times)
+            n = view_cylinder(shaft.camera_p_rcm, shaft.camera_v_axis, shaft.radius_mm).n_contour[:, edge]
+            y = (row - own.cy) / own.fy
+            x = -(n[:, 1] * y + n[:, 2]) / n[:, 0]
+            line, at_once = truth.n_contour_read[i, edge], truth.n_contour[i, edge]
+            off = [own.fx * (m @ np.stack([x, y, np.ones_like(x)])) / np.linalg.norm(m[:2]) for m in (line, at_once)]
+            assert np.abs(off[0]).max() < 0.15  # the seen contour is a little curved
+            leaning.append(np.abs(off[1]).max())
+    assert len(leaning) > 8
+    assert max(leaning) > 1.0
+
+
+def test_rows_read_at_once_show_the_contours_as_they_are(world: World) -> None:
+    truth = side_truth(world, "right")
+    np.testing.assert_array_equal(truth.n_contour_read, truth.n_contour)
 
 
 def end_error(picture: np.ndarray, truth: SideTruth, i: int) -> float:
