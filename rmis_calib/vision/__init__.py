@@ -7,7 +7,7 @@ __getattr__, __dir__, __all__ = lazy_exports(
     {
         "DetectorSettings": ".settings",
         "FrameReason": ".reasons",
-        "ShaftDetections": ".shaft_lines",
+        "ShaftDetections": ".detections",
         "ShaftDetector": ".shaft_lines",
         "draw_detections": ".overlay",
         "draw_dot": ".overlay",

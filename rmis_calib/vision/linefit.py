@@ -6,8 +6,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-_ITERATIONS = 9
+_ITERATIONS = 5
 _BLOCKS = 12
+# Lines compared at first, and points that are asked about each.
+_PAIRS, _VOTERS = 64, 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +23,9 @@ class LineFit:
     spread_t: Float[Tensor, "*b"]
     """Weighted rms of the stations about their mean."""
     scatter_px: Float[Tensor, "*b"]
-    """Robust standard deviation of one point."""
+    """Standard deviation of one of the points that carry the line."""
+    wander_px: Float[Tensor, "*b"]
+    """Robust standard deviation of all trusted points about the line, whether they carry it or not."""
     sigma_px: Float[Tensor, "*b"]
     """Standard deviation of the line at centre_t - spread_t and at centre_t + spread_t, each."""
     inliers: Float[Tensor, "*b"]
@@ -33,9 +37,11 @@ def fit_lines(
     y: Float[Tensor, "*b p"],
     weight: Float[Tensor, "*b p"],
     trusted: Bool[Tensor, "*b p"],
+    tolerance: Float[Tensor, "*b"],
     floor_px: float,
 ) -> LineFit:
-    """Lines by reweighted least squares (Huber, then Tukey's biweight on a robust scale).
+    """Lines through the points that agree: from the line that most agree with, by least squares with Tukey's biweight
+    on a robust scale.
 
     The uncertainty is the larger of what independent points give and what the means of twelve consecutive blocks
     say: texture, glare and a bent shaft move neighbours together.
@@ -45,27 +51,53 @@ def fit_lines(
         y: lateral places, px.
         weight: prior weight of each point, 0 for none.
         trusted: points that set the first lines and the scale; the others join where they agree.
+        tolerance: standard deviation of a point that is not astray, px, by which lines are first compared.
         floor_px: smallest standard deviation of one point.
     """
-    robust = weight * trusted
-    scale = torch.full(t.shape[:-1], 1e3, dtype=t.dtype, device=t.device)
-    for step in range(_ITERATIONS):
+    offset, slope = _consensus(t, y, weight * trusted, tolerance)
+    near = (y - offset[..., None] - slope[..., None] * t).abs() < 3 * tolerance[..., None]
+    robust = weight * (trusted & near)
+    for _ in range(_ITERATIONS):
         offset, slope, centre, spread = _solve(t, y, robust)
         residual = y - offset[..., None] - slope[..., None] * t
-        size = torch.where((weight > 0) & trusted, residual.abs(), torch.nan)
+        size = torch.where((weight > 0) & trusted & near, residual.abs(), torch.nan)
         scale = torch.nan_to_num(1.4826 * size.nanmedian(-1).values).clamp(min=floor_px)
-        z = residual / scale[..., None]
-        tukey = (1 - (z / 4.7).square()).clamp(min=0.0).square()
-        huber = 1.3 / z.abs().clamp(min=1.3)
-        robust = weight * (huber * trusted if step < 4 else tukey)
+        robust = weight * (1 - (residual / (4.7 * scale[..., None])).square()).clamp(min=0.0).square()
+    wander = torch.where((weight > 0) & trusted, residual.abs(), torch.nan).nanmedian(-1).values
     inliers = robust.sum(-1).square() / robust.square().sum(-1).clamp(min=1e-9)
     scatter = ((robust * residual.square()).sum(-1) / robust.sum(-1).clamp(min=1e-9)).sqrt().clamp(min=floor_px)
     independent = scatter * (2.0 / inliers.clamp(min=3.0)).sqrt()
     together = _block_sigma(residual, robust, (t - centre[..., None]) / spread[..., None].clamp(min=1e-6))
     sigma = torch.maximum(independent, together)
     return LineFit(
-        offset, slope, centre, spread, scatter, sigma, (robust > 0.1 * weight.clamp(min=1e-9)).sum(-1).to(t.dtype)
+        offset,
+        slope,
+        centre,
+        spread,
+        scatter,
+        (1.4826 * torch.nan_to_num(wander)).clamp(min=floor_px),
+        sigma,
+        (robust > 0.1 * weight.clamp(min=1e-9)).sum(-1).to(t.dtype),
     )
+
+
+def _consensus(
+    t: Float[Tensor, "*b p"], y: Float[Tensor, "*b p"], weight: Float[Tensor, "*b p"], tolerance: Float[Tensor, "*b"]
+) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]:
+    """Of the lines through pairs of points at least a quarter apart, the one that most points agree with."""
+    count = t.shape[-1]
+    first = torch.arange(_PAIRS, device=t.device) * (count - 1) // _PAIRS
+    apart = count // 4 + (torch.arange(_PAIRS, device=t.device) * 37) % (count // 2)
+    second = (first + apart) % count
+    run = t[..., second] - t[..., first]
+    slope = (y[..., second] - y[..., first]) / torch.where(run.abs() < 1e-3, 1e-3, run)
+    offset = y[..., first] - slope * t[..., first]
+    usable = (weight[..., first] > 0) & (weight[..., second] > 0) & (run.abs() > 1e-3)
+    some = slice(None, None, max(1, count // _VOTERS))
+    residual = y[..., None, some] - offset[..., None] - slope[..., None] * t[..., None, some]
+    agree = torch.exp(-0.5 * (residual / tolerance[..., None, None]).square()) @ weight[..., some, None]
+    best = torch.where(usable, agree[..., 0], -1.0).argmax(-1, keepdim=True)
+    return offset.gather(-1, best)[..., 0], slope.gather(-1, best)[..., 0]
 
 
 def _solve(t: Tensor, y: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -5,7 +5,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from rmis_calib.vision.shaft_lines import ShaftDetections
+from rmis_calib.vision.detections import ShaftDetections
 
 _EDGE_COLOURS = ((255, 196, 0), (0, 214, 255), (170, 255, 90))
 """Amber, cyan, green: best, second, third shaft. All legible on red tissue, pink phantom and dark lab."""

@@ -209,19 +209,25 @@ def score(evidence: Evidence, settings: DetectorSettings) -> Float[Tensor, "b k"
     return evidence.length * quality * evidence.purity**2 * entering * (long_enough & evidence.strips.valid)
 
 
-def distinct(evidence: Evidence, scores: Float[Tensor, "b k"], count: int) -> tuple[Tensor, Float[Tensor, "b c"]]:
-    """Indices and scores of the best `count` strips that do not lie on one another."""
+def lies_on(evidence: Evidence) -> Bool[Tensor, "b k k"]:
+    """Whether the middle of each strip (first) lies on another (second) that runs the same way."""
     strips = evidence.strips
     middle = 0.5 * (evidence.start + evidence.end)
     at = strips.points(middle[..., None], strips.contour(middle[..., None]).mean(2))[:, :, 0]  # (b, k, 2)
-    relative = at[:, None] - strips.origin[:, :, None]  # point of the second seen from the first
-    station = (relative * strips.along[:, :, None]).sum(-1)
-    lateral = (relative * strips.left[:, :, None]).sum(-1)
-    contour = strips.contour(station)
-    margin = 0.25 * evidence.width[:, :, None]
-    covered = (lateral < contour[:, :, 0] + margin) & (lateral > contour[:, :, 1] - margin)
+    relative = at[:, :, None] - strips.origin[:, None]
+    station = (relative * strips.along[:, None]).sum(-1)  # (b, first, second)
+    lateral = (relative * strips.left[:, None]).sum(-1)
+    contour = strips.contour(station.mT).movedim(-1, 1)  # (b, first, second, 2)
+    margin = 0.25 * evidence.width[:, None]
+    covered = (lateral < contour[..., 0] + margin) & (lateral > contour[..., 1] - margin)
     parallel = torch.einsum("bki,bji->bkj", strips.along, strips.along).abs() > 0.95
-    overlap = (covered | covered.mT) & parallel
+    return covered & parallel
+
+
+def distinct(evidence: Evidence, scores: Float[Tensor, "b k"], count: int) -> tuple[Tensor, Float[Tensor, "b c"]]:
+    """Indices and scores of the best `count` strips that do not lie on one another."""
+    on = lies_on(evidence)
+    overlap = on | on.mT
     left = scores.clone()
     chosen, values = [], []
     for _ in range(count):

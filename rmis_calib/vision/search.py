@@ -19,6 +19,10 @@ _LINES, _PAIRS, _STRIPS = 48, 160, 20
 # Blurred ridges of the field's border reach this far into it, small px.
 _RIM_PX = 4
 _LIT_MERIT = 0.75
+# A strip of the dark view that lies on one of the lit view: below this share of its width it is a part of the shaft,
+# between the other two it has a shadow; and the merit that is left to it.
+_PART_OF_LIT, _SHADOWED = 0.6, (1.1, 1.6)
+_PART_MERIT = 0.5
 # A ridge below this is texture: 4 per cent of brightness a small pixel.
 _MIN_GRADIENT = 0.04
 
@@ -38,6 +42,8 @@ class Stages:
     lines: hough.HoughLines
     evidence: scoring.Evidence
     scores: Float[Tensor, "b k"]
+    leads: Float[Tensor, "b c"]
+    """Scores of the strips that are measured, the best first."""
     factor: int
     """Full-resolution pixels a small one."""
     origin: tuple[float, float]
@@ -99,8 +105,8 @@ def search(
     ridge, votes = ridge.unflatten(0, (-1, count)).any(1), votes.unflatten(0, (-1, count)).amax(1)
     lines = hough.HoughLines(**{n: v.unflatten(0, (-1, count)).flatten(1, 2) for n, v in vars(lines).items()})
     evidence, scores = evidence.views_together(count), scores.unflatten(0, (-1, count)).flatten(1, 2)
-    drawn = (rgb, seen, views[:, 0], views[:, -1], ridge, votes, lines, evidence, scores, canvas.factor, canvas.origin)
-    return found, Stages(*drawn)
+    pictures = (rgb, seen, views[:, 0], views[:, -1], ridge, votes)
+    return found, Stages(*pictures, lines, evidence, scores, found.scores, canvas.factor, canvas.origin)
 
 
 def _best(
@@ -122,7 +128,14 @@ def _best(
     straight, wander = trace.straighten(trace.trace(picture, few.strips.listed(keep), settings))
     merit = torch.zeros_like(best)
     merit[keep] = best[keep] / (1 + (wander / (0.02 * few.width[keep] + picture.factor)).square())[0]
-    merit = torch.where(few.strips.frame % picture.views > 0, _LIT_MERIT * merit, merit)
+    lit = few.strips.frame % picture.views > 0
+    merit = torch.where(lit, _LIT_MERIT * merit, merit)
+    # Between a contour and a stripe of glare lies a dark strip too, as straight as the shaft that holds it; and a shaft
+    # with its shadow is another, a little wider.
+    over = scoring.lies_on(few) & lit[:, None] & ~lit[:, :, None] & (merit > 0)[:, None]  # dark (first) on lit (second)
+    share = few.width[:, :, None] / few.width[:, None].clamp(min=1e-6)
+    wrong = over & ((share < _PART_OF_LIT) | ((share > _SHADOWED[0]) & (share < _SHADOWED[1])))
+    merit = torch.where(wrong.any(-1), _PART_MERIT * merit, merit)
     index, best = scoring.distinct(few, merit, wanted)
     place = torch.zeros_like(keep, dtype=torch.int64)
     place[keep] = torch.arange(straight.frame.shape[1], device=place.device)

@@ -27,11 +27,11 @@ class DetectorSettings:
     black_level: float = Field(default=0.035, ge=0, lt=0.5)
     """Brightness, fraction of full scale, up to which a border of the picture counts as outside the field of view."""
     second_look_below: float = Field(default=0.9, ge=0, le=1)
-    """Pictures whose surest shaft is less sure than this are searched again in a second view, in which glare, blood and
-    cavities hide less, at twice the time. 1 looks twice at all of them, 0 at none."""
-    min_confidence: float = Field(default=0.25, ge=0, le=1)
-    """Candidates below this confidence are not reported. With 0.38 none of 80 rendered pictures without a shaft showed
-    one (8 with 0.25), but 5 of 55 shafts of the real frames were lost."""
+    """Pictures without a shaft as sure as this, or with more in them that may be one, are searched again in a second
+    view, in which glare, blood, shadows and cavities hide less, at twice the time. 1 looks twice at all of them, 0 at
+    none."""
+    min_confidence: float = Field(default=0.40, ge=0, le=1)
+    """Candidates below this confidence are not reported."""
     end_run_widths: float = Field(default=1.4, gt=0)
     """A stretch of shaft beyond an interruption (a ball, a clip) must be this many widths long to carry the end."""
     edge_samples: int = Field(default=256, ge=32, le=4096)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -12,6 +12,7 @@ from rmis_calib.errors import ShapeError
 from rmis_calib.geometry import Camera, axis_from_contours, plane_normal_from_points
 from rmis_calib.vision import confidence, edges, ends
 from rmis_calib.vision.canvas import Canvas, plan_canvas
+from rmis_calib.vision.detections import ShaftDetections, unresolved, with_more
 from rmis_calib.vision.lens import Lens
 from rmis_calib.vision.linefit import LineFit, fit_lines
 from rmis_calib.vision.masks import checked_masks
@@ -24,43 +25,9 @@ from rmis_calib.vision.strips import Strips
 from rmis_calib.vision.trace import Trace
 
 _POLYLINE = 24
-
-
-@dataclass(frozen=True, eq=False)
-class ShaftDetections:
-    """Up to k shafts a frame, best first.
-
-    Convention: normalised undistorted coordinates (x/z, y/z); without a camera they are pixels. Edge 0 is on the left
-    of somebody who walks in the picture from the RCM side to the tip; points run in that direction. Where `valid` is
-    false everything else is NaN or false.
-    """
-
-    valid: Bool[Tensor, "b k"]
-    reason: Int[Tensor, " b"]
-    """`FrameReason` of each frame."""
-    contour_xy: Float[Tensor, "b k 2 2 2"]
-    """[edge, point, xy]: two points a contour, one rms spread of its samples before and behind their centre."""
-    contour_sigma: Float[Tensor, "b k 2"]
-    """Standard deviation of either point of a contour across it; the errors of the two points are uncorrelated."""
-    axis_xy: Float[Tensor, "b k 2 2"]
-    """Two points of the projected axis: the bisector of the contour planes (the midline without a camera)."""
-    axis_sigma: Float[Tensor, "b k"]
-    end_xy: Float[Tensor, "b k 2"]
-    """Projection of the point of the axis at which the shaft ends."""
-    end_sigma: Float[Tensor, "b k"]
-    """Standard deviation along the axis."""
-    end_valid: Bool[Tensor, "b k"]
-    direction_known: Bool[Tensor, "b k"]
-    """Whether it is certain which side the tip is on."""
-    confidence: Float[Tensor, "b k"]
-    contour_uv: Float[Tensor, "b k 2 p 2"]
-    """Contours as raw-pixel polylines from the border to the shaft's end, for pictures."""
-    end_uv: Float[Tensor, "b k 2"]
-    """The boundary as it was seen, raw pixels."""
-    scatter_px: Float[Tensor, "b k 2"]
-    """Robust standard deviation of one contour point about its line, px."""
-    blur_px: Float[Tensor, "b k 2"]
-    """Standard deviation of the blur of each contour, px."""
+# Shading, blood and compression move points together over more than the blocks from which a line's uncertainty is
+# estimated: of factors from 1 to 2 this one makes the errors of the presets most likely.
+_LONG_ERRORS = 1.6
 
 
 class ShaftDetector:
@@ -102,11 +69,12 @@ class ShaftDetector:
             return self._look(images, masks, broken, 1)[0]
         if twice == 1:
             return self._look(images, None, broken, 2)[0]
-        found, _ = self._look(images, None, broken, 1)
-        again = ~(found.valid[:, 0] & (found.confidence[:, 0] >= twice))
+        found, stages = self._look(images, None, broken, 1)
+        again = unresolved(found, stages.leads / images.shape[-1], twice)
         if not bool(again.any()):
             return found
-        better, _ = self._look(images[again], None, broken[again], 2)
+        second, _ = self._look(images[again], None, broken[again], 2)
+        better = with_more(found.of_frames(again), second, twice)
         for name, value in vars(found).items():
             value[again] = getattr(better, name)
         return found
@@ -173,18 +141,17 @@ class ShaftDetector:
         end = ends.locate(picture, strips, trace.end, trace.width, points.blur_px.mean(-1), floor)
         offered = edges.at_stations(trace.sides, trace.t, points.t)
         share = (fit.inliers / offered.sum(-1).clamp(min=1)).amin(-1)
-        certain = confidence.chance(confidence.marks(trace, fit, points, share))
+        reach = math.hypot(*images.shape[-2:])
+        certain = confidence.capped(confidence.chance(confidence.marks(trace, fit, share, reach)), trace)
         convergence = (fit.slope[..., 0] - fit.slope[..., 1]).abs()
         cylinder = convergence < math.tan(math.radians(self.settings.max_convergence_deg))
         clear = cylinder & (share > 0.15) & ((scores > 0) & ~broken[:, None])[keep] & (fit.spread_t.amin(-1) > 0)
-        plausible = confidence.plausible(trace, fit, share, math.hypot(*images.shape[-2:]))
+        plausible = confidence.plausible(trace, fit, share, reach)
         valid = clear & plausible & (certain >= self.settings.min_confidence)
         measured = self._assemble(trace, strips, points, fit, end, valid, certain)
         reason = _reason(stages, scores, _spread(clear, keep), _spread(valid, keep), broken)
         fields = {name: _spread(value, keep) for name, value in measured.items()}
-        dense = ShaftDetections(reason=reason, **fields)
-        order = torch.where(dense.valid, dense.confidence, -1.0).sort(dim=1, descending=True, stable=True).indices
-        return _reorder(dense, order)
+        return ShaftDetections(reason=reason, **fields).surest_first()
 
     def _contours(self, picture: FullPicture, trace: Trace) -> tuple[edges.EdgePoints, LineFit]:
         """Edge points found roughly, then finely, and the lines through them."""
@@ -196,14 +163,16 @@ class ShaftDetector:
         use = edges.at_stations(trace.sides, trace.t, t)
         points = edges.rough(picture, strips, t, lateral, use, step)
         main = edges.at_stations(trace.main[:, :, None], trace.t, t).expand_as(both)
-        line = fit_lines(both, points.lateral, points.valid.to(t.dtype), main, 0.01)
+        # Beyond that a point belongs to something else: tissue, a stain, the edge of a stripe of glare.
+        tolerance = 0.3 * points.blur_px + 0.01 * trace.width[..., None]
+        line = fit_lines(both, points.lateral, points.valid.to(t.dtype), main, tolerance, 0.01)
         straight = line.offset[..., None] + line.slope[..., None] * both
         near = points.valid & ((points.lateral - straight).abs() < 4 * line.scatter_px[..., None])
         centre = straight + smooth_over(points.lateral - straight, near)
         points = edges.fine(picture, strips, t, centre, use, (points.blur_px / 1.3).clamp(1.0, 4.0))
         usual = masked_median(points.height, points.valid)[..., None].clamp(min=1e-6)
         weight = points.valid * (points.height / usual).clamp(0.3, 1.5)
-        return points, fit_lines(both, points.lateral, weight, main, 0.01)
+        return points, fit_lines(both, points.lateral, weight, main, tolerance, 0.01)
 
     def _assemble(
         self,
@@ -227,7 +196,7 @@ class ShaftDetector:
         share = torch.linspace(0, 1, _POLYLINE, device=stop.device)
         t = trace.start[..., None] + (stop - trace.start)[..., None] * share
         polyline = strips.points(t[:, :, None].expand(-1, -1, 2, -1), strips.contour(t))
-        sigma = (fit.sigma_px.square() + self.settings.sigma_floor_px**2).sqrt() / focal
+        sigma = ((_LONG_ERRORS * fit.sigma_px).square() + self.settings.sigma_floor_px**2).sqrt() / focal
         known = trace.start_at_border & ~trace.end_at_border
         end_valid = end.valid & valid & ~trace.end_at_border
         return dict(
@@ -306,10 +275,3 @@ def _reason(stages: Stages, scores: Tensor, clear: Tensor, valid: Tensor, broken
     ):
         reason = torch.where(failed, int(why), reason)
     return torch.where(valid.any(1), int(FrameReason.OK), reason)
-
-
-def _reorder(found: ShaftDetections, order: Tensor) -> ShaftDetections:
-    """The same detections with the candidates of each frame in another order."""
-    rows = torch.arange(order.shape[0], device=order.device)[:, None]
-    fields = {name: value[rows, order] for name, value in vars(found).items() if name != "reason"}
-    return replace(found, **fields)

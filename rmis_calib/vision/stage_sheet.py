@@ -3,10 +3,10 @@
 import cv2
 import numpy as np
 
+from rmis_calib.vision.detections import ShaftDetections
 from rmis_calib.vision.overlay import draw_detections
 from rmis_calib.vision.reasons import FrameReason
 from rmis_calib.vision.search import Stages
-from rmis_calib.vision.shaft_lines import ShaftDetections
 from rmis_calib.vision.stages import draw_stages
 
 _PANEL_WIDTH, _COLUMNS, _GAP, _TITLE, _HEADER = 480, 5, 12, 50, 58

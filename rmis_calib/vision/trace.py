@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from rmis_calib.vision.follow import Middle, Sides, follow, read_middle
 from rmis_calib.vision.linefit import fit_lines
 from rmis_calib.vision.runs import (
     bridge,
@@ -23,7 +24,6 @@ from rmis_calib.vision.runs import (
     run_minimum,
     run_range,
     smooth_over,
-    third_lowest,
 )
 from rmis_calib.vision.scoring import MAX_BRIGHTER
 from rmis_calib.vision.settings import DetectorSettings
@@ -32,7 +32,6 @@ from rmis_calib.vision.strips import SmallPicture, Strips
 from rmis_calib.vision.wrists import between_wrists
 
 _STATIONS = 160
-_OFFSETS = 9
 # Where between shaft (0) and surroundings (1) the inside may lie. Wrists of bare metal lie at 0.5 to 0.7, shaded shafts
 # below 0.35, a stretch of shaft lit differently beyond an interruption at up to 0.6 (frames of both real sets).
 _TONE_SHARE = 0.38
@@ -43,6 +42,10 @@ _CONTRAST_SHARE = 0.8
 _SAME_TONE = 0.35
 # Largest change of tone over three stations of a plain shaft; its screws and jaws change by more.
 _RUN_UNEVENNESS = 0.45
+# Share of the width by which a small contour point that is not astray may lie off its line.
+_TOLERANCE = 0.02
+# Step of tint, as it enters the dark view, from which tissue is told from what has no colour.
+_TINTED = 0.15
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,58 +76,12 @@ class Trace:
     """Supported length, px."""
     contrast: Float[Tensor, "b k"]
     """Median over the shaft of the weaker contour's step, log brightness and tint."""
+    tint: Float[Tensor, "b k"]
+    """Median over the shaft of the inside's tint, as it enters the dark view."""
+    evenness: Float[Tensor, "b k"]
+    """Step of tint across the weaker contour over that across the stronger one, 0 to 1; 1 where nothing is tinted."""
     surround: Float[Tensor, "b k"]
     """How far the surroundings lie above the shaft's own tone."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Sides:
-    lateral: Float[Tensor, "b k 2 s"]
-    rise: Float[Tensor, "b k 2 s"]
-    outer: Float[Tensor, "b k 2 s"]
-    brightness: Float[Tensor, "b k 2 s"]
-    seen: Bool[Tensor, "b k 2 s"]
-
-
-def _follow(picture: SmallPicture, strips: Strips, stations: Float[Tensor, "b k s"]) -> _Sides:
-    """The strongest outward rise near each predicted contour."""
-    predicted = strips.contour(stations)  # (b, k, 2, s)
-    width = (predicted[:, :, :1] - predicted[:, :, 1:]).clamp(min=1.0)
-    unit = float(picture.factor)
-    near = (0.07 * width).clamp(min=1.5 * unit) * stations.new_tensor([1.0, -1.0])[:, None]  # outwards
-    reach = (0.2 * width).clamp(min=2.0 * unit)
-    share = torch.linspace(-1, 1, _OFFSETS, device=stations.device)[:, None, None]
-    lateral = predicted[:, :, None] + reach[:, :, None] * share  # (b, k, o, 2, s)
-    both = torch.stack([lateral + near[:, :, None], lateral - near[:, :, None]], 2)
-    value, seen, tone = picture.read(strips, stations[:, :, None, None, None], both)
-    seen = seen[:, :, 0] & seen[:, :, 1]
-    rise = (value[:, :, 0] - value[:, :, 1]) * seen
-    best = (rise * torch.exp(-0.5 * (1.2 * share) ** 2)).argmax(2, keepdim=True)
-    layers = (lateral, rise, value[:, :, 0], tone[:, :, 0])
-    place, step, outer, beside = (layer.gather(2, best)[:, :, 0] for layer in layers)
-    return _Sides(place, step, outer, beside, seen[:, :, _OFFSETS // 2])
-
-
-@dataclass(frozen=True, eq=False)
-class _Middle:
-    inner: Float[Tensor, "b k s"]
-    far: Float[Tensor, "b k s"]
-    brightness: Float[Tensor, "b k s"]
-    tint: Float[Tensor, "b k s"]
-    seen: Bool[Tensor, "b k s"]
-
-
-def _read_middle(picture: SmallPicture, strips: Strips, stations: Float[Tensor, "b k s"], sides: _Sides) -> _Middle:
-    """Tone of the inside, and of both sides most of a width away from the middle line."""
-    left, right = sides.lateral.unbind(2)
-    across = left.new_tensor([-0.35, -0.233, -0.117, 0.0, 0.117, 0.233, 0.35, -0.85, 0.85])[:, None]
-    y = 0.5 * (left + right)[:, :, None] + (left - right)[:, :, None] * across
-    value, seen, tone = picture.read(strips, stations[:, :, None], y)
-    # The third darkest of seven: a glare stripe may cover half of the width and more.
-    tint = weighted_tint(value, tone, picture.lit(strips))
-    inner, brightness, tint = (third_lowest(layer[:, :, :7]) for layer in (value, tone, tint))
-    far = torch.where(seen[:, :, 7:], value[:, :, 7:], torch.inf).amin(2)
-    return _Middle(inner, far, brightness, tint, seen[:, :, 3])
 
 
 def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> Trace:
@@ -132,8 +89,8 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
     t = torch.linspace(-1, 1, _STATIONS, device=strips.offset.device) * picture.half_diagonal_px
     spacing = float(t[1] - t[0])
     stations = t.expand(*strips.valid.shape, _STATIONS)
-    sides = _follow(picture, strips, stations)
-    middle = _read_middle(picture, strips, stations, sides)
+    sides = follow(picture, strips, stations)
+    middle = read_middle(picture, strips, stations, sides)
     span = sides.lateral[:, :, 0] - sides.lateral[:, :, 1]
     step = torch.where(sides.seen, sides.rise, torch.inf).amin(2)
     outer = torch.where(sides.seen, sides.outer, torch.inf).amin(2)
@@ -149,7 +106,12 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
     width = masked_median(span, on & sides.seen.all(2))
     on &= run_lengths(on) * spacing > (0.4 * width).clamp(min=2.5 * spacing)[..., None]
     main = longest_run(on, 0.7 * width / spacing)
-    joined = _joined(t, middle.brightness + middle.tint, edged, on, main, possible, width)
+    lit = picture.lit(strips)[..., None]
+    own = torch.where(lit, middle.inner, middle.brightness + middle.tint)
+    same_tone = torch.where(lit[..., 0], (0.5 * surround).clamp(max=_SAME_TONE), _SAME_TONE)
+    beside = masked_median(sides.brightness.mean(2), middle.seen)[..., None]
+    possible &= middle.brightness - beside < MAX_BRIGHTER  # white plastic and metal are as neutral as a shaft
+    joined = _joined(t, own, same_tone, edged, on, main, possible, middle.seen, width)
     on, main = on | joined, main | joined
     to_border, borders = _enter(t, edged | joined, main, middle.seen, width)
     on, main = on | to_border, main | to_border
@@ -157,6 +119,7 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
     wander = smooth_over(sides.lateral - line, (on[:, :, None] & sides.seen))
     carries_end = _carries_end(middle, on & strips.valid[..., None], main, width / spacing, settings)
     down, up = (_same_tone(t, middle.inner, main, middle.seen, surround, width, high) for high in (False, True))
+    tint = masked_median(middle.tint, main)
     whole = Trace(
         strips=strips,
         t=t,
@@ -171,6 +134,8 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
         width=width,
         length=on.float().sum(-1) * spacing,
         contrast=masked_median(torch.where(torch.isfinite(step), step, 0.0), on),
+        tint=tint,
+        evenness=_evenness(weighted_tint(sides.outer, sides.brightness, picture.lit(strips)), tint, main),
         surround=surround,
     )
     low_end = torch.where(torch.isfinite(begins), begins, first_on(t, carries_end | down))
@@ -178,7 +143,7 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
 
 
 def _plain_stretch(
-    middle: _Middle, sides: _Sides, edged: Bool[Tensor, "b k s"], span: Float[Tensor, "b k s"]
+    middle: Middle, sides: Sides, edged: Bool[Tensor, "b k s"], span: Float[Tensor, "b k s"]
 ) -> tuple[Float[Tensor, "b k"], Float[Tensor, "b k"]]:
     """First and last station before a wrist; infinite where there is none, or nothing is left before it.
 
@@ -195,10 +160,12 @@ def _plain_stretch(
 def _joined(
     t: Float[Tensor, " s"],
     inner: Float[Tensor, "b k s"],
+    same_tone: Float[Tensor, "b k"],
     edged: Bool[Tensor, "b k s"],
     on: Bool[Tensor, "b k s"],
     main: Bool[Tensor, "b k s"],
     possible: Bool[Tensor, "b k s"],
+    seen: Bool[Tensor, "b k s"],
     width: Float[Tensor, "b k"],
 ) -> Bool[Tensor, "b k s"]:
     """Stations between contoured stretches, or between one and the border, at which the inside keeps its tone.
@@ -207,19 +174,34 @@ def _joined(
     """
     step = t[1] - t[0]
     level = masked_median(inner, edged)[..., None]
-    same = possible & ((inner - level).abs() < _SAME_TONE)
+    same = possible & ((inner - level).abs() < same_tone[..., None])
     run = run_any(bridge(on | same, 0.5 * width / step) & possible, main)
     reach = 0.5 * width + 3 * step
-    low = first_on(t, run) - first_on(t, possible) < reach
-    high = last_on(t, possible) - last_on(t, run) < reach
+    low = first_on(t, run) - first_on(t, seen) < reach
+    high = last_on(t, seen) - last_on(t, run) < reach
     first, last = first_on(t, on & run), last_on(t, on & run)
     from_low = (low & ~high)[..., None] | (t >= first[..., None])
     from_high = (high & ~low)[..., None] | (t <= last[..., None])
     return run & from_low & from_high
 
 
+def _evenness(
+    beside: Float[Tensor, "b k 2 s"], tint: Float[Tensor, "b k"], main: Bool[Tensor, "b k s"]
+) -> Float[Tensor, "b k"]:
+    """`Trace.evenness`: between a contour and a stripe of glare, only one side is tissue.
+
+    Args:
+        beside: tint just outside of either contour.
+        tint: of the inside.
+        main: stations that count.
+    """
+    step = masked_median(beside, main[:, :, None].expand_as(beside)) - tint[..., None]
+    weaker, stronger = step.amin(-1), step.amax(-1)
+    return torch.where(stronger > _TINTED, (weaker / stronger.clamp(min=_TINTED)).clamp(0.0, 1.0), 1.0)
+
+
 def _carries_end(
-    middle: _Middle,
+    middle: Middle,
     on: Bool[Tensor, "b k s"],
     main: Bool[Tensor, "b k s"],
     width: Float[Tensor, "b k"],
@@ -271,7 +253,9 @@ def _same_tone(
 def straighten(traced: Trace) -> tuple[Strips, Float[Tensor, "b k"]]:
     """The strips with straight lines through their traced contours, and how far these wander from them, px."""
     t, main = traced.t.expand_as(traced.lateral), traced.main[:, :, None].expand_as(traced.lateral)
-    line = fit_lines(t, traced.lateral, traced.sides.to(t.dtype), main, 0.1 * float(traced.t[1] - traced.t[0]))
+    spacing = float(traced.t[1] - traced.t[0])
+    tolerance = (_TOLERANCE * traced.width).clamp(min=0.3 * spacing)[..., None].expand_as(traced.strips.offset)
+    line = fit_lines(t, traced.lateral, traced.sides.to(t.dtype), main, tolerance, 0.1 * spacing)
     sane = (line.inliers > 5) & (line.slope.abs() < 0.2)
     both = sane.all(-1, keepdim=True)
     strips = traced.strips

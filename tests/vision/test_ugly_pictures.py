@@ -62,11 +62,11 @@ def test_second_look_is_for_pictures_without_a_sure_shaft_only(monkeypatch: pyte
         assert looks == expected
 
 
-def test_confidence_falls_as_contours_wander_soften_and_shrink() -> None:
-    good = torch.tensor([[-5.0, -4.4, 1.0, 1.4, 0.9, -0.1]])
+def test_confidence_falls_as_contours_wander_and_shrink_and_the_inside_is_coloured() -> None:
+    good = torch.tensor([[-5.0, 1.0, 0.9, -0.1, -1.0, 0.02]])
     sure = float(chance(tuple(good.T[:, None]))[0, 0])
     assert sure > 0.9
-    for mark, worse in enumerate((-3.0, -2.5, 0.0, 0.0, 0.3, -1.5)):
+    for mark, worse in enumerate((-3.0, 0.0, 0.3, -1.5, -3.0, 1.0)):
         bad = good.clone()
         bad[0, mark] = worse
         assert float(chance(tuple(bad.T[:, None]))[0, 0]) < sure
