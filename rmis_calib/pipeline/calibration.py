@@ -11,6 +11,13 @@ from torch import Tensor
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.errors import InsufficientDataError
 from rmis_calib.io import Recording, ShaftObservations
+from rmis_calib.pipeline.choosing import (
+    Choice,
+    choices_by_instrument,
+    consistent_choice,
+    first_choice,
+    reach_of,
+)
 from rmis_calib.pipeline.detection import Progress, View, detect_recording, no_progress
 from rmis_calib.pipeline.device import require_device
 from rmis_calib.pipeline.estimation import (
@@ -33,10 +40,7 @@ from rmis_calib.pipeline.next_motion import (
     may_advise,
 )
 from rmis_calib.pipeline.observing import (
-    Choice,
     assemble,
-    consistent_choice,
-    first_choice,
     predict_contours,
     predict_ends,
     reasons_for,
@@ -145,17 +149,29 @@ def run_calibration(
     require_device(config.device)
     poses = motion_poses(recording, config.device)
     views = detect_recording(recording, config, progress, segment=segment)
-    choices = tuple(first_choice(select_frames(view.detections, poses.frames)) for view in views)
     draft = _without_joint_offsets(config)
-    run = _solve_choice(recording, draft, views, poses, choices, progress)
+    detections = tuple(select_frames(view.detections, poses.frames) for view in views)
+    surest, instruments = tuple(first_choice(found) for found in detections), choices_by_instrument(detections)
+    # Where several instruments are seen, each is tried: the logged one is the one that moves with the joints.
+    run = _surest([_solve_choice(recording, draft, views, poses, c, progress) for c in (surest, *instruments)])
     for _ in range(CHOICE_ROUNDS - 1):
-        better = _choose_again(run)
+        better = _choose_again(run, several=bool(instruments))
         if better is None or all(new.same_as(old) for new, old in zip(better, run.choices, strict=True)):
             break
         run = _solve_choice(recording, draft, views, poses, better, progress, run.clock_s)
     if draft != config:
         run = _solve_choice(recording, config, views, poses, run.choices, progress, run.clock_s)
     return _advised(run, config)
+
+
+def _surest(runs: list[CalibrationRun]) -> CalibrationRun:
+    """The run whose answer is predicted best: what does not move with the joints looks like noise of many pixels."""
+
+    def rank(run: CalibrationRun) -> tuple[bool, float]:
+        told = run.result.status in ("ok", "weak")
+        return not told, run.result.observability["working_point_sigma_mm"] if told else np.inf
+
+    return min(runs, key=rank)
 
 
 def _without_joint_offsets(config: CalibrationConfig) -> CalibrationConfig:
@@ -240,16 +256,24 @@ def _kinematic_unknowns(
     return KinematicUnknowns(recording, poses.frames, config.device)
 
 
-def _choose_again(run: CalibrationRun) -> tuple[Choice, ...] | None:
-    """Candidates nearest to what the first answer predicts; None when there is no answer to predict from."""
-    predictions = [run.predicted_contours(view) for view in run.views]
-    if run.result.status not in ("ok", "weak") or any(prediction is None for prediction in predictions):
+def _choose_again(run: CalibrationRun, several: bool) -> tuple[Choice, ...] | None:
+    """Candidates nearest to what the first answer predicts; None when there is no answer to predict from.
+
+    Only of pictures that show several instruments any is passed over: in others, what does not fit speaks against the
+    answer.
+    """
+    if run.result.status not in ("ok", "weak"):
         return None
-    return tuple(
-        consistent_choice(select_frames(view.detections, run.poses.frames), prediction)
-        for view, prediction in zip(run.views, predictions, strict=True)
-        if prediction is not None
-    )
+    used = torch.as_tensor(run.result.motions.used[run.poses.frames], device=run.poses.arm_T_rcm.device)
+    better = []
+    for view, choice in zip(run.views, run.choices, strict=True):
+        prediction = run.predicted_contours(view)
+        if prediction is None:
+            return None
+        found = select_frames(view.detections, run.poses.frames)
+        reach = reach_of(choice, found, prediction, used) if several else torch.inf
+        better.append(consistent_choice(found, prediction, reach))
+    return tuple(better)
 
 
 def _motions(

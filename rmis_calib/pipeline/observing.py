@@ -1,68 +1,21 @@
-"""Detections and kinematics to the solver's observations; which candidate of a frame is the instrument's shaft."""
-
-from dataclasses import dataclass
+"""Detections and kinematics to the solver's observations."""
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from rmis_calib.config import CalibrationConfig
-from rmis_calib.geometry.lines import contour_planes, point_line_distance
+from rmis_calib.geometry.lines import contour_planes
 from rmis_calib.geometry.rigid import rotate_vectors, transform_points
 from rmis_calib.io import Recording, ShaftObservations
+from rmis_calib.pipeline.choosing import Choice, walked_back
 from rmis_calib.pipeline.detection import View
 from rmis_calib.pipeline.poses import MotionPoses
 from rmis_calib.vision import FrameReason, ShaftDetections
 
 DIRECTION_UNKNOWN = "the picture does not show on which side the tip is"
-
-
-@dataclass(frozen=True, eq=False)
-class Choice:
-    """Which candidate of each motion's frame is taken for the instrument's shaft.
-
-    Attributes:
-        candidate: (M,) index; -1 for none.
-        reversed: (M,) whether RCM side and tip side (and so the two edges) are exchanged.
-    """
-
-    candidate: Int[Tensor, " m"]
-    reversed: Bool[Tensor, " m"]
-
-    @property
-    def taken(self) -> Bool[Tensor, " m"]:
-        return self.candidate >= 0
-
-    def where(self, known: Bool[Tensor, " m"]) -> "Choice":
-        """This choice in the motions that are known, none in the others."""
-        return Choice(torch.where(known, self.candidate, -1), self.reversed & known)
-
-    def same_as(self, other: "Choice") -> bool:
-        return torch.equal(self.candidate, other.candidate) and torch.equal(self.reversed, other.reversed)
-
-
-def first_choice(detections: ShaftDetections) -> Choice:
-    """The most confident candidate whose tip side is known."""
-    usable = detections.valid & detections.direction_known
-    candidate = torch.where(usable.any(-1), usable.int().argmax(-1), -1)
-    return Choice(candidate, torch.zeros_like(usable[:, 0]))
-
-
-def consistent_choice(detections: ShaftDetections, predicted_n_contour: Float[Tensor, "m 2 3"]) -> Choice:
-    """The candidate nearest to where a first calibration and the kinematics put the shaft.
-
-    A candidate whose tip side the picture does not show is taken in the direction that fits. Whether the nearest one
-    is near enough is the solver's outlier test, which knows the noise.
-    """
-    forward = _distance(detections.contour_xy, predicted_n_contour)
-    backward = _distance(_reverse(detections.contour_xy), predicted_n_contour)
-    backward = torch.where(detections.direction_known, torch.inf, backward)
-    distance = torch.where(detections.valid, torch.minimum(forward, backward), torch.inf)
-    best = distance.argmin(dim=-1)
-    reached = torch.isfinite(distance.gather(-1, best[:, None])[:, 0])
-    turned = (backward < forward).gather(-1, best[:, None])[:, 0]
-    return Choice(torch.where(reached, best, -1), turned & reached)
+ANOTHER_INSTRUMENT = "no shaft in the picture is where the joints put the instrument"
 
 
 def predict_contours(
@@ -133,12 +86,14 @@ def head_observations(recording: Recording, poses: MotionPoses) -> dict[str, np.
 
 def reasons_for(view: View, poses: MotionPoses, choice: Choice) -> list[str]:
     """(M,) why a motion has no shaft in this view; empty where it has one."""
-    codes = view.detections.reason.cpu().numpy()[poses.frames]
-    found = view.found.cpu().numpy()[poses.frames]
-    taken = choice.taken.cpu().numpy()
+    found = select_frames(view.detections, poses.frames)
+    codes, taken = found.reason.cpu().numpy(), choice.taken.cpu().numpy()
+    known = (found.valid & found.direction_known).any(-1).cpu().numpy()
+    sentences = np.where(known, ANOTHER_INSTRUMENT, DIRECTION_UNKNOWN)
+    seen = found.valid.any(-1).cpu().numpy()
     return [
-        "" if is_taken else (DIRECTION_UNKNOWN if is_found else FrameReason(int(code)).sentence)
-        for code, is_found, is_taken in zip(codes, found, taken, strict=True)
+        "" if is_taken else (str(sentence) if is_seen else FrameReason(int(code)).sentence)
+        for code, is_seen, is_taken, sentence in zip(codes, seen, taken, sentences, strict=True)
     ]
 
 
@@ -163,7 +118,7 @@ def _measured(side: str, detections: ShaftDetections, choice: Choice, floor: flo
         return torch.where(valid.reshape(-1, *[1] * (value.ndim - 1)), value, torch.nan).cpu().numpy()
 
     contour, axis, sigma = pick("contour_xy"), pick("axis_xy"), pick("contour_sigma")
-    contour = torch.where(turned[:, None, None, None], _reverse(contour), contour)
+    contour = torch.where(turned[:, None, None, None], walked_back(contour), contour)
     axis = torch.where(turned[:, None, None], axis.flip(-2), axis)
     sigma = torch.where(turned[:, None], sigma.flip(-1), sigma)
     has_end = choice.taken & pick("end_valid") & ~turned
@@ -176,17 +131,3 @@ def _measured(side: str, detections: ShaftDetections, choice: Choice, floor: flo
         f"sigma_end_{side}": known(pick("end_sigma").hypot(least), has_end),
         f"valid_{side}": choice.taken.cpu().numpy(),
     }
-
-
-def _reverse(contour_xy: Float[Tensor, "*batch 2 2 2"]) -> Float[Tensor, "*batch 2 2 2"]:
-    """Seen by somebody who walks the other way: the edges change sides and the points change order."""
-    return contour_xy.flip(-3).flip(-2)
-
-
-def _distance(
-    contour_xy: Float[Tensor, "m k 2 2 2"], predicted_n_contour: Float[Tensor, "m 2 3"]
-) -> Float[Tensor, "m k"]:
-    """Root mean square distance of the four contour points from the predicted lines, normalised units."""
-    line = predicted_n_contour / predicted_n_contour[..., :2].norm(dim=-1, keepdim=True)
-    distance = point_line_distance(contour_xy.to(line.dtype), line[:, None, :, None, :])
-    return distance.square().mean(dim=(-2, -1)).sqrt()
