@@ -33,6 +33,12 @@ class CalibrationConfig:
     """Masks of one's own in place of the search by colour: a folder of pictures in the order of the frames, white on
     shafts (for stereo two folders below it, `right` and `left`), or a TorchScript (.pt) or ONNX (.onnx) model from
     pictures (b, 3, h, w) in [0, 1] to masks (b, h, w), above 0.5 on shafts."""
+    prior: str | None = None
+    """A first idea of the answer: a result.json, or a YAML file with camera_right_T_arm (4x4 rows, mm). Of several
+    shafts in a picture the one nearest to where it puts the instrument is taken at first; it is no measurement."""
+    instrument_at: tuple[int, float, float] | None = None
+    """Frame, and pixel (u, v) of the right camera, on the shaft of the logged instrument, where pictures show several.
+    Without it, and without a prior, it is the one that moves with the joints."""
     measurements: tuple[Measurement, ...] = ("axis", "contours", "ends")
     """What the estimate may use of each picture; `heads` are the labelled head points, else kept for evaluation."""
     model_sigma_px: float = 0.3

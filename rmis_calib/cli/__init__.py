@@ -4,6 +4,7 @@ Exit codes: 0 a result that passed its own checks; 1 no trustworthy result; 2 ba
 traceback); 130 interrupted. Nothing heavy is imported before a command's arguments are understood.
 """
 
+import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -37,6 +38,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         command = import_module("rmis_calib.cli.commands").parse(COMMANDS[argv[0]][0], argv[0], argv[1:])
     except SystemExit as exit_request:  # tyro has printed the help, or what is wrong with the usage
         return int(exit_request.code or 0)
+    except BrokenPipeError:  # the help, to a reader that has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_OK
     except Exception as error:
         return _report(error)
     try:

@@ -15,7 +15,6 @@ from rmis_calib.pipeline.choosing import (
     Choice,
     choices_by_instrument,
     consistent_choice,
-    first_choice,
     reach_of,
 )
 from rmis_calib.pipeline.detection import Progress, View, detect_recording, no_progress
@@ -47,6 +46,7 @@ from rmis_calib.pipeline.observing import (
     select_frames,
 )
 from rmis_calib.pipeline.poses import MotionPoses, motion_poses
+from rmis_calib.pipeline.starting import first_choices
 from rmis_calib.results import STATUS_SENTENCES, CalibrationResult, Motions
 from rmis_calib.solver import Solution
 from rmis_calib.vision.masks import Segmenter
@@ -151,9 +151,9 @@ def run_calibration(
     views = detect_recording(recording, config, progress, segment=segment)
     draft = _without_joint_offsets(config)
     detections = tuple(select_frames(view.detections, poses.frames) for view in views)
-    surest, instruments = tuple(first_choice(found) for found in detections), choices_by_instrument(detections)
-    # Where several instruments are seen, each is tried: the logged one is the one that moves with the joints.
-    run = _surest([_solve_choice(recording, draft, views, poses, c, progress) for c in (surest, *instruments)])
+    instruments = choices_by_instrument(detections)
+    starts = first_choices(recording, config, poses, detections, instruments)
+    run = _surest([_solve_choice(recording, draft, views, poses, choices, progress) for choices in starts])
     for _ in range(CHOICE_ROUNDS - 1):
         better = _choose_again(run, several=bool(instruments))
         if better is None or all(new.same_as(old) for new, old in zip(better, run.choices, strict=True)):

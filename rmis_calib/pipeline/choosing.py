@@ -114,6 +114,21 @@ def choices_by_instrument(views: tuple[ShaftDetections, ...]) -> list[tuple[Choi
     return choices
 
 
+def pointed_at(detections: ShaftDetections, xy: Float[Tensor, " 2"]) -> int:
+    """Of one picture's candidates, the one that a point lies on, or within its width of the axis; -1 for none.
+
+    Args:
+        detections: of the picture, one frame.
+        xy: normalised undistorted coordinates.
+    """
+    start, along = detections.axis_xy[0, :, 0], detections.axis_xy[0, :, 1] - detections.axis_xy[0, :, 0]
+    relative = xy.to(start) - start
+    off = (relative[:, 0] * along[:, 1] - relative[:, 1] * along[:, 0]).abs() / along.norm(dim=-1)
+    width = (detections.contour_xy[0, :, 0] - detections.contour_xy[0, :, 1]).mean(1).norm(dim=-1)
+    off = torch.where(detections.valid[0] & (off < width), off, torch.inf)
+    return int(off.argmin()) if bool(torch.isfinite(off).any()) else -1
+
+
 def _distances(
     detections: ShaftDetections, predicted_n_contour: Float[Tensor, "m 2 3"]
 ) -> tuple[Float[Tensor, "m k"], Bool[Tensor, "m k"]]:

@@ -75,7 +75,7 @@ def evaluate(
     rotation_deg, translation_mm, sigmas = None, None, None
     if truth is not None or beside.is_file():
         rotation_deg, translation_mm, sigmas = _errors(
-            result.camera_right_T_arm.matrix, result.covariance, _read_truth(Path(truth or beside))
+            result.camera_right_T_arm.matrix, result.covariance, read_transform(Path(truth or beside))
         )
     errors = head_point_errors(result, opened, motion_poses(opened))
     return Evaluation(summarise_head_points(errors), rotation_deg, translation_mm, sigmas)
@@ -118,13 +118,20 @@ def summarise_head_points(errors: dict[str, np.ndarray] | None) -> dict[str, dic
     return summary or None
 
 
-def _read_truth(path: Path) -> RigidTransform:
+def read_transform(path: Path) -> RigidTransform:
+    """`camera_right_T_arm` of a YAML file (4x4 rows, mm) or of a result.json.
+
+    Raises:
+        FileError: the file cannot be read.
+        InputError: it holds no such transform.
+    """
     raw = load_yaml(path, error=InputError)
     if "camera_right_T_arm" not in raw:
         raise InputError(where=str(path), expected="a key camera_right_T_arm", found=", ".join(raw))
+    rows = raw["camera_right_T_arm"]
     try:
-        matrix = torch.tensor(raw["camera_right_T_arm"], dtype=torch.float64)
-    except (TypeError, ValueError) as error:
+        matrix = torch.tensor(rows["matrix"] if isinstance(rows, dict) else rows, dtype=torch.float64)
+    except (KeyError, TypeError, ValueError) as error:
         raise InputError(where=f"{path}: camera_right_T_arm", expected="4x4 rows", found=str(error)) from error
     return RigidTransform("camera_right", "arm", matrix)
 

@@ -10,8 +10,18 @@ import yaml
 import data_synth
 import rmis_calib as rc
 from rmis_calib.config import parse_config
+from rmis_calib.errors import InputError
 from rmis_calib.geometry.lines import contour_planes
-from rmis_calib.pipeline.choosing import choices_by_instrument, consistent_choice, first_choice, reach_of
+from rmis_calib.pipeline.calibration import run_calibration
+from rmis_calib.pipeline.choosing import (
+    choices_by_instrument,
+    consistent_choice,
+    first_choice,
+    pointed_at,
+    reach_of,
+)
+from rmis_calib.pipeline.observing import select_frames
+from rmis_calib.pipeline.starting import first_choices
 from rmis_calib.vision import ShaftDetections
 
 RADIUS_MM = 4.0
@@ -159,15 +169,54 @@ def test_one_instrument_and_a_few_false_candidates_are_not_several():
     assert choices_by_instrument((together([one] * 39 + [two]),)) == []
 
 
+def test_a_point_on_a_shaft_names_it():
+    both = detections([contour_points(*OTHER), contour_points(*OURS)], [True, True])
+    on_ours = contour_points(*OURS).mean((0, 1))
+    assert pointed_at(both, on_ours) == 1
+    assert pointed_at(both, contour_points(*OTHER).mean((0, 1))) == 0
+    assert pointed_at(both, on_ours + torch.tensor([0.3, 0.3])) == -1
+    assert pointed_at(detections([torch.full((2, 2, 2), torch.nan)], [False]), on_ours) == -1
+
+
 def test_the_instrument_that_moves_with_the_joints_is_the_one_that_calibrates(tmp_path):
     """Two dark instruments in a picture with smoke and blood; the one without joints is often the surer find."""
-    config = replace(data_synth.load_synth_config("hard"), motions=36)
-    folder = data_synth.write_recording(tmp_path / "hard", config)
+    synth = replace(data_synth.load_synth_config("hard"), motions=36)
+    folder = data_synth.write_recording(tmp_path / "hard", synth)
     recording = rc.load_recording(folder)
-    result = rc.calibrate(recording, parse_config({"solver": {"unknowns": {"clock": False}}}))
+    config = parse_config({"solver": {"unknowns": {"clock": False}}})
+    run = run_calibration(recording, config)
     truth = yaml.safe_load((folder / "ground_truth.yaml").read_text())["camera_right_T_arm"]
-    turn = result.camera_right_T_arm.matrix.numpy()[:3, :3].T @ np.array(truth)[:3, :3]
+    turn = run.result.camera_right_T_arm.matrix.numpy()[:3, :3].T @ np.array(truth)[:3, :3]
     angle_deg = np.rad2deg(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
+    assert run.result.status == "ok"
     assert angle_deg < 1.0  # measured: 0.41, 1 sigma 0.54
     # The surest candidates of a fifth of the pictures are the other instrument's.
-    assert result.motions.used.sum() > 25
+    assert run.result.motions.used.sum() > 25
+    check_what_is_known_beforehand(recording, run, config, folder)
+
+
+def check_what_is_known_beforehand(recording, run, config, folder):
+    """A prior and a pointing user lead to the candidates that the joints led to."""
+    found = tuple(select_frames(view.detections, run.poses.frames) for view in run.views)
+    instruments = choices_by_instrument(found)
+    assert len(instruments) >= 2
+
+    def start(**known):
+        (choices,) = first_choices(recording, replace(config, **known), run.poses, found, instruments)
+        return choices[0].candidate
+
+    own = run.choices[0].candidate
+    by_prior = start(prior=str(folder / "ground_truth.yaml"))
+    assert float((by_prior == own).double().mean()) > 0.9
+    uv = np.load(folder / "truth.npz")["right_contour_uv"][:, :, 32].mean(1)
+    motion = int((own >= 0).nonzero()[0, 0])
+    u, v = uv[run.poses.frames[motion]]
+    pointed = start(instrument_at=(int(run.poses.frames[motion]), float(u), float(v)))
+    assert int(pointed[motion]) == int(own[motion])
+    assert float((pointed == own)[pointed >= 0].double().mean()) > 0.9
+    with pytest.raises(InputError, match="instrument_at: expected a point on a shaft"):
+        start(instrument_at=(int(run.poses.frames[motion]), 5.0, 5.0))
+    with pytest.raises(InputError, match="none there in frame 1000"):
+        start(instrument_at=(1000, 5.0, 5.0))
+    with pytest.raises(InputError, match="camera_right_T_arm"):
+        start(prior=str(folder / "stereo.yaml"))

@@ -1,0 +1,72 @@
+"""Which candidates a calibration starts with: as a prior has it, as the user points, or each instrument in turn."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from rmis_calib.config import CalibrationConfig
+from rmis_calib.errors import InputError
+from rmis_calib.io import Recording
+from rmis_calib.pipeline.choosing import Choice, consistent_choice, first_choice, pointed_at
+from rmis_calib.pipeline.evaluation import read_transform
+from rmis_calib.pipeline.observing import predict_contours, select_frames
+from rmis_calib.pipeline.poses import MotionPoses
+from rmis_calib.vision import ShaftDetections
+
+_PRIOR_REACH = 0.05
+"""How far off a shaft may be from where a prior puts it, normalised units, where pictures show several: 3 deg, or 5 mm
+at 100 mm. Farther off lie other instruments, and halves and shadows of shafts."""
+
+
+def first_choices(
+    recording: Recording,
+    config: CalibrationConfig,
+    poses: MotionPoses,
+    detections: tuple[ShaftDetections, ...],
+    instruments: list[tuple[Choice, ...]],
+) -> list[tuple[Choice, ...]]:
+    """Candidates to solve with at first, one entry an attempt: as `config.prior` or `config.instrument_at` has it; else
+    the surest ones and, where pictures show several instruments, each of these.
+
+    Args:
+        recording: for the cameras.
+        config: what is known beforehand.
+        poses: kinematics of the motions.
+        detections: of the motions, one entry a camera.
+        instruments: from `choices_by_instrument`.
+    Raises:
+        InputError: `config.prior` is no transform, or there is no shaft where `config.instrument_at` points.
+    """
+    if config.prior is not None:
+        return [_near_prior(recording, config.prior, poses, detections, several=bool(instruments))]
+    surest = tuple(first_choice(found) for found in detections)
+    if config.instrument_at is None:
+        return [surest, *instruments]
+    frame, u, v = config.instrument_at
+    motion = np.flatnonzero(poses.frames == frame)
+    xy, _ = recording.stereo.right.undistort_points(torch.tensor([u, v], dtype=torch.float64))
+    shown = pointed_at(select_frames(detections[0], motion), xy) if len(motion) else -1
+    if shown < 0:
+        found = f"none there in frame {frame}"
+        raise InputError(
+            where="instrument_at", expected="a point on a shaft that is detected (see `detect`)", found=found
+        )
+    own = [choices for choices in instruments if int(choices[0].candidate[motion[0]]) == shown]
+    return own or [surest]
+
+
+def _near_prior(
+    recording: Recording, prior: str, poses: MotionPoses, detections: tuple[ShaftDetections, ...], several: bool
+) -> tuple[Choice, ...]:
+    """The candidates nearest to where a prior puts the shaft."""
+    camera_T_arm = [read_transform(Path(prior)).matrix]
+    extrinsics = recording.stereo.camera_left_T_camera_right
+    if extrinsics is not None and len(detections) == 2:
+        camera_T_arm.append(extrinsics.matrix @ camera_T_arm[0])
+    reach = _PRIOR_REACH if several else torch.inf
+    radius_mm = recording.shaft_diameter_mm / 2
+    return tuple(
+        consistent_choice(found, predict_contours(matrix.to(poses.arm_T_rcm), poses, radius_mm), reach)
+        for found, matrix in zip(detections, camera_T_arm, strict=True)
+    )
