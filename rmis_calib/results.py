@@ -91,6 +91,7 @@ class CalibrationResult:
         head_point_error_px: per camera `{median, rms, max, count}`, where head points are known.
         config: the resolved configuration.
         versions: of this package and of what it computes with.
+        notes: what was guessed or mended while the input was read, a sentence each.
     """
 
     status: Status
@@ -106,6 +107,7 @@ class CalibrationResult:
     head_point_error_px: dict[str, dict[str, Any]] | None = None
     config: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str | None] = field(default_factory=lambda: package_versions())
+    notes: tuple[str, ...] = ()
     created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
 
     @property
@@ -149,6 +151,7 @@ class CalibrationResult:
             "head_point_error_px": self.head_point_error_px,
             "config": self.config,
             "versions": self.versions,
+            "notes": list(self.notes),
             "created": self.created,
         }
         return finite_or_none(record)
@@ -203,6 +206,7 @@ class CalibrationResult:
             head_point_error_px=raw["head_point_error_px"],
             config=raw["config"],
             versions=raw["versions"],
+            notes=tuple(raw.get("notes") or ()),
             created=raw["created"],
         )
 

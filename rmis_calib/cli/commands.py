@@ -289,6 +289,8 @@ def conclude(result: "CalibrationResult", written: Path) -> int:
     """Print the answer and where it is; the exit code says whether to trust it."""
     console.print(f"[bold]{result.status}[/bold]: {result.message}\n", soft_wrap=True)
     print_table(result.camera_right_T_arm.name if result.camera_right_T_arm else "no transform", result_rows(result))
+    for note in result.notes:
+        console.print(f"note: {note}", soft_wrap=True, markup=False)
     if not result.trustworthy:
         print_advice(result.observability.get("advice") or [])
     console.print(f"written: {written}\n", soft_wrap=True)

@@ -1,8 +1,13 @@
 """Checks on arrays that several files share."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from rmis_calib.errors import InputError
+
+Note = Callable[[str], None]
+"""Takes one sentence about what was guessed or mended while a file was read; it ends up in the result."""
 
 # The entries of R^T R may differ from the identity by this much: far above the rounding of a printed matrix of seven
 # digits, far below any wrong one.
@@ -35,3 +40,7 @@ def check_rigid(matrix: np.ndarray, where: str, error: type[InputError], numbers
             i = int(bad.argmax())
             place = where if matrix.ndim == 2 else f"{where}[{i if numbers is None else numbers[i]}]"
             raise error(where=place, expected=expected, found=found(i))
+
+
+def no_note(sentence: str) -> None:
+    """The note-taker of callers who do not want one."""

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rmis_calib.errors import RecordingError
+from rmis_calib.io._checks import Note, no_note
 from rmis_calib.io._csv import Table, read_table, require_columns, require_increasing
 from rmis_calib.io._schemas import DEGREES, FULL_TURN_RAD, METRES
 from rmis_calib.io.robot import Joint, Robot
@@ -115,13 +116,14 @@ class JointLog:
         return spline, spline.derivative()
 
 
-def load_joints(path: str | Path, robot: Robot, arms: tuple[str, ...]) -> JointLog:
+def load_joints(path: str | Path, robot: Robot, arms: tuple[str, ...], note: Note = no_note) -> JointLog:
     """The joint log of the arms in use.
 
     Args:
         path: joints.csv.
         robot: names, units and limits of the joints.
         arms: arms whose joints the log must hold, all of them and no others.
+        note: told what was mended.
 
     Raises:
         FileError: the file is absent or unreadable.

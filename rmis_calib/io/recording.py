@@ -43,6 +43,8 @@ class Recording:
     clock_offset_s: float
     """Joint time = frame time + this."""
     head_points: HeadPoints | None
+    notes: tuple[str, ...] = ()
+    """What was guessed or mended while the files were read, a sentence each."""
 
     @property
     def n_frames(self) -> int:
@@ -87,11 +89,12 @@ def load_recording(path: str | Path, clock_offset_s: float | None = None) -> Rec
     if not np.isfinite(offset):
         raise InputError(where="clock_offset_s", expected="a finite number of seconds", found=offset)
 
+    notes: list[str] = []
     robot = _load_robot(schema, folder)
-    stereo = load_stereo(folder / schema.stereo)
+    stereo = load_stereo(folder / schema.stereo, notes.append)
     _check_cameras(schema, stereo, where)
     arms = tuple(arm for arm in (schema.laparoscope_arm, schema.instrument_arm) if arm is not None)
-    joints = load_joints(folder / schema.joints, robot, arms)
+    joints = load_joints(folder / schema.joints, robot, arms, notes.append)
     right = _open_camera(folder / schema.right, stereo.right)
     left = None if schema.left is None or stereo.left is None else _open_camera(folder / schema.left, stereo.left)
     frame_times_s = _frame_times(schema, folder, right, left)
@@ -101,7 +104,7 @@ def load_recording(path: str | Path, clock_offset_s: float | None = None) -> Rec
     heads = read_head_points(head_path, len(frame_times_s), size, left is not None) if head_path.exists() else None
     return Recording(
         folder, robot, stereo, right, left, joints, frame_times_s, schema.laparoscope_arm, schema.instrument_arm,
-        schema.shaft_diameter_mm, float(offset), heads,
+        schema.shaft_diameter_mm, float(offset), heads, tuple(notes),
     )  # fmt: skip
 
 

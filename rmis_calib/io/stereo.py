@@ -8,7 +8,7 @@ import torch
 from rmis_calib.errors import RecordingError
 from rmis_calib.geometry.cameras import Camera, StereoRig
 from rmis_calib.geometry.rigid import RigidTransform
-from rmis_calib.io._checks import check_rigid
+from rmis_calib.io._checks import Note, check_rigid, no_note
 from rmis_calib.io._schemas import METRES, CameraSchema, StereoSchema
 from rmis_calib.io._validation import validate
 from rmis_calib.io.configs import load_yaml
@@ -19,8 +19,12 @@ _BASELINE_MM = (0.1, 200.0)
 _FOCAL_WIDTHS = (0.05, 100.0)
 
 
-def load_stereo(path: str | Path) -> StereoRig:
+def load_stereo(path: str | Path, note: Note = no_note) -> StereoRig:
     """Cameras in float64. `left` is None for a file of one camera.
+
+    Args:
+        path: stereo.yaml.
+        note: told what was mended.
 
     Raises:
         FileError: the file is absent or unreadable.

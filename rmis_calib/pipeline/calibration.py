@@ -46,9 +46,10 @@ from rmis_calib.pipeline.observing import (
     select_frames,
 )
 from rmis_calib.pipeline.poses import MotionPoses, motion_poses
-from rmis_calib.pipeline.starting import first_choices
+from rmis_calib.pipeline.starting import first_choices, read_prior
 from rmis_calib.results import STATUS_SENTENCES, CalibrationResult, Motions
 from rmis_calib.solver import Solution
+from rmis_calib.vision import ShaftDetections
 from rmis_calib.vision.masks import Segmenter
 
 JOINTS_UNKNOWN = "the joint log does not cover this time"
@@ -147,20 +148,22 @@ def run_calibration(
     """
     config = config or CalibrationConfig()
     require_device(config.device)
+    prior = read_prior(config)
     poses = motion_poses(recording, config.device)
     views = detect_recording(recording, config, progress, segment=segment)
     draft = _without_joint_offsets(config)
     detections = tuple(select_frames(view.detections, poses.frames) for view in views)
     instruments = choices_by_instrument(detections)
-    starts = first_choices(recording, config, poses, detections, instruments)
+    starts = first_choices(recording, config, poses, detections, instruments, prior)
     run = _surest([_solve_choice(recording, draft, views, poses, choices, progress) for choices in starts])
     for _ in range(CHOICE_ROUNDS - 1):
-        better = _choose_again(run, several=bool(instruments))
+        better = _choose_again(run, detections, several=bool(instruments))
         if better is None or all(new.same_as(old) for new, old in zip(better, run.choices, strict=True)):
             break
         run = _solve_choice(recording, draft, views, poses, better, progress, run.clock_s)
     if draft != config:
         run = _solve_choice(recording, config, views, poses, run.choices, progress, run.clock_s)
+    run = replace(run, result=replace(run.result, notes=recording.notes + run.result.notes))
     return _advised(run, config)
 
 
@@ -256,7 +259,9 @@ def _kinematic_unknowns(
     return KinematicUnknowns(recording, poses.frames, config.device)
 
 
-def _choose_again(run: CalibrationRun, several: bool) -> tuple[Choice, ...] | None:
+def _choose_again(
+    run: CalibrationRun, detections: tuple[ShaftDetections, ...], several: bool
+) -> tuple[Choice, ...] | None:
     """Candidates nearest to what the first answer predicts; None when there is no answer to predict from.
 
     Only of pictures that show several instruments any is passed over: in others, what does not fit speaks against the
@@ -266,11 +271,10 @@ def _choose_again(run: CalibrationRun, several: bool) -> tuple[Choice, ...] | No
         return None
     used = torch.as_tensor(run.result.motions.used[run.poses.frames], device=run.poses.arm_T_rcm.device)
     better = []
-    for view, choice in zip(run.views, run.choices, strict=True):
+    for view, found, choice in zip(run.views, detections, run.choices, strict=True):
         prediction = run.predicted_contours(view)
         if prediction is None:
             return None
-        found = select_frames(view.detections, run.poses.frames)
         reach = reach_of(choice, found, prediction, used) if several else torch.inf
         better.append(consistent_choice(found, prediction, reach))
     return tuple(better)

@@ -13,6 +13,7 @@ import dataclasses
 import numpy as np
 import torch
 from bench_vision_real_frames import DATA, distances_px, pictures, read_labels
+from bench_vision_render import rms_px
 
 from data_synth import load_synth_config, render_frames
 from data_synth.world import build_world
@@ -25,13 +26,6 @@ PRESETS = (
 REAL_PX, REAL_WEIGHT = 12.0, 4.0
 LOOKS = [DetectorSettings(min_confidence=0.0, second_look_below=below) for below in (0.0, 1.0)]
 """One view of every picture, and two."""
-
-
-def contour_rms_px(points: np.ndarray, normals: np.ndarray, focal: float) -> float:
-    """Rms distance of (edge, point, xy) from the lines (edge, 3)."""
-    lines = normals / np.linalg.norm(normals[:, :2], axis=1, keepdims=True)
-    homogeneous = np.concatenate([points, np.ones((2, 2, 1))], -1)
-    return float(np.sqrt((np.einsum("epi,ei->ep", homogeneous, lines) ** 2).mean()) * focal)
 
 
 class Recorder:
@@ -64,7 +58,7 @@ def rendered(recorder: Recorder, preset: str, seed: int, frames: int) -> list[tu
             points = found.contour_xy[frame, rank].double().numpy()
             shafts = [t.n_contour_read[frame] for t in (truth, *truth.others) if t.visible[frame]]
             orders = (points,) if found.direction_known[frame, rank] else (points, points[::-1])
-            each = (contour_rms_px(order, n, float(camera.focal)) for n in shafts for order in orders)
+            each = (float(rms_px(order, n[None], float(camera.focal))[0]) for n in shafts for order in orders)
             sigma = float(found.contour_sigma[frame, rank].square().mean().sqrt()) * float(camera.focal)
             marks = recorder.marks_of(float(found.confidence[frame, rank]))
             rows.append((marks, min(each, default=np.inf) < 3 * sigma, 1.0, seed))

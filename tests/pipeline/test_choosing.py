@@ -21,7 +21,7 @@ from rmis_calib.pipeline.choosing import (
     reach_of,
 )
 from rmis_calib.pipeline.observing import select_frames
-from rmis_calib.pipeline.starting import first_choices
+from rmis_calib.pipeline.starting import first_choices, read_prior
 from rmis_calib.vision import ShaftDetections
 
 RADIUS_MM = 4.0
@@ -202,7 +202,8 @@ def check_what_is_known_beforehand(recording, run, config, folder):
     assert len(instruments) >= 2
 
     def start(**known):
-        (choices,) = first_choices(recording, replace(config, **known), run.poses, found, instruments)
+        told = replace(config, **known)
+        (choices,) = first_choices(recording, told, run.poses, found, instruments, read_prior(told))
         return choices[0].candidate
 
     own = run.choices[0].candidate

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from measured_from_truth import SMALL, observations_from_truth
 
 import data_synth
 import rmis_calib as rc
@@ -18,7 +19,6 @@ from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
 from rmis_calib.pipeline.next_motion import advice_record, camera_view, joint_box, joint_candidates, seen_view
 from rmis_calib.pipeline.poses import motion_poses
 
-SMALL = {"fx_px": 175.0, "fy_px": 175.0, "cx_px": 80.0, "cy_px": 60.0, "distortion": [0.0] * 5}
 SIGMA_PX = 0.2
 CONFIG = parse_config({"edge_bias_px": 0.0, "solver": {"bias_correction": False, "advice": {"candidates": 200}}})
 
@@ -42,21 +42,10 @@ def weak(tmp_path_factory):
     path = written(tmp_path_factory.mktemp("weak") / "recording")
     recording = rc.load_recording(path)
     poses = motion_poses(recording)
-    return recording, KinematicUnknowns(recording, poses.frames, "cpu"), observations(path, recording, poses)
-
-
-def observations(path, recording, poses, kinds=("axis", "contour", "end")):
-    truth = np.load(path / "truth.npz")
-    generator = np.random.default_rng(0)
-    sigma = SIGMA_PX / float(recording.stereo.right.focal)
-    arrays = {f"{kind}_right": truth[f"right_{kind}_xy"][poses.frames] for kind in kinds}
-    return rc.ShaftObservations(
-        arm_T_rcm=poses.arm_T_rcm.numpy(),
-        rcm_v_axis=poses.rcm_v_axis.numpy(),
-        rcm_s_end_mm=poses.rcm_s_end_mm.numpy(),
-        shaft_radius_mm=recording.shaft_diameter_mm / 2,
-        sigma_image=sigma,
-        **{name: value + sigma * generator.standard_normal(value.shape) for name, value in arrays.items()},
+    return (
+        recording,
+        KinematicUnknowns(recording, poses.frames, "cpu"),
+        observations_from_truth(path, recording, poses, SIGMA_PX),
     )
 
 
