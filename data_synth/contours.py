@@ -3,8 +3,8 @@ leading batch.
 
 Derivation: the tangent planes through the optical centre contain the axis direction v, so their unit normals are
 n = a u + b (u x v) with u the unit vector to the axis point nearest to the centre, at distance D; tangency
-n . (D u) = +-r gives a = +-r / D. Edge 0 is on the left of somebody who walks in the picture from the RCM to the tip,
-edge 1 on the right (x right, y down).
+n . (D u) = +-r gives a = +-r / D. Edge 0 is left of the axis, directed in the picture from the RCM to the tip,
+edge 1 right of it (x right, y down).
 """
 
 from __future__ import annotations

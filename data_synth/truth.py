@@ -26,8 +26,7 @@ class SideTruth:
     """What one camera sees of the instrument in N frames; `xy` is normalised undistorted, `uv` raw pixels. NaN where
     not visible.
 
-    Edge 0 is on the left of somebody who walks in the picture from the RCM to the tip; of two points the RCM side comes
-    first.
+    Edge 0 is left of the axis, directed in the picture from the RCM to the tip; of two points the RCM side comes first.
 
     Attributes:
         camera_T_rcm: (N, 4, 4) true pose of the RCM frame.

@@ -63,15 +63,15 @@ p1, p2, k3. To the right in the scene is to the right in the picture, and down i
 ([60.0, 60.0], True)
 
 **Lines and planes.** A line through normalised points a and b, and the plane that it spans with the optical centre, is
-(xa, ya, 1) x (xb, yb, 1): positive on the right-hand side of somebody who walks from a to b, where y is down. Shaft
+(xa, ya, 1) x (xb, yb, 1): positive right of the directed line from a to b, where y is down. Shaft
 lines are given by two points, the one on the RCM's side first.
 
 >>> line = g.line_through_points(vector(0, 0), vector(1, 0))
 >>> float(g.point_line_distance(vector(0.5, 0.25), line))
 0.25
 
-**The two edges of a shaft.** Edge 0 is on the left-hand side of somebody who walks in the picture from the RCM to the
-tip, edge 1 on the right-hand side: edge 0 is the upper one where the tip is on the right. Here the axis is 100 mm
+**The two edges of a shaft.** Edge 0 is left of the axis, directed in the picture from the RCM to the tip,
+and edge 1 is right of it: edge 0 is the upper one where the tip is on the right. Here the axis is 100 mm
 ahead and the radius 60 mm, so that the edges are at y = -3/4 and y = 3/4:
 
 >>> planes = g.contour_planes(vector(0, 0, 100), vector(1, 0, 0), 60.0)

@@ -34,7 +34,7 @@ def line_through_points(
 ) -> Float[Tensor, "*#batch 3"]:
     """Line through two points, scaled so that l0^2 + l1^2 = 1; (0, 0, 0) where the points coincide.
 
-    Convention: with x right and y down, the line is positive on the right-hand side of somebody who walks from a to b.
+    Convention: with x right and y down, the line is positive right of the directed line from a to b.
     """
     line = _join(xy_a, xy_b)
     return line / _safe_norm(line[..., :2])
@@ -45,7 +45,7 @@ def plane_normal_from_points(
 ) -> Float[Tensor, "*#batch 3"]:
     """Unit normal of the plane through the optical centre and two image points; (0, 0, 0) where the points coincide.
 
-    Convention: (xa, ya, 1) x (xb, yb, 1); positive on the right-hand side of somebody who walks from a to b.
+    Convention: (xa, ya, 1) x (xb, yb, 1); positive right of the directed line from a to b.
     """
     normal = _join(xy_a, xy_b)
     return normal / _safe_norm(normal)
@@ -92,8 +92,8 @@ def contour_planes(
     With M = p x v, D = |M|, m = M / D, u = v x m and sin(alpha) = r / D: cos(alpha) m + sin(alpha) u for edge 0 and
     cos(alpha) m - sin(alpha) u for edge 1.
 
-    Convention: edge 0 is on the left-hand side of somebody who walks in the picture along v (RCM to tip): the upper
-    edge where v points right. Both normals have the sign of `plane_normal_from_points` for points in the order of v.
+    Convention: edge 0 is left of the axis as it is directed in the picture, along v (RCM to tip): the upper edge
+    where v points right. Both normals have the sign of `plane_normal_from_points` for points in the order of v.
     Where the optical centre is inside the cylinder or touches it (`is_outside_cylinder` is false) there is no
     contour; the result is then that of alpha just below a right angle: finite, with no derivative with respect to r /
     D.

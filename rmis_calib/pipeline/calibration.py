@@ -13,9 +13,9 @@ from rmis_calib.errors import InsufficientDataError
 from rmis_calib.io import Recording, ShaftObservations
 from rmis_calib.pipeline.choosing import (
     Choice,
+    association_gate,
     choices_by_instrument,
     consistent_choice,
-    reach_of,
 )
 from rmis_calib.pipeline.detection import Progress, View, detect_recording, no_progress
 from rmis_calib.pipeline.device import require_device
@@ -275,7 +275,7 @@ def _choose_again(
         prediction = run.predicted_contours(view)
         if prediction is None:
             return None
-        reach = reach_of(choice, found, prediction, used) if several else torch.inf
+        reach = association_gate(choice, found, prediction, used) if several else torch.inf
         better.append(consistent_choice(found, prediction, reach))
     return tuple(better)
 

@@ -70,7 +70,7 @@ def consistent_choice(
     return Choice(torch.where(reached, best, -1), turned & reached)
 
 
-def reach_of(
+def association_gate(
     choice: Choice, detections: ShaftDetections, predicted_n_contour: Float[Tensor, "m 2 3"], used: Bool[Tensor, " m"]
 ) -> float:
     """How far off a shaft may be and still be the one that a calibration predicts, normalised units: well beyond the
@@ -135,7 +135,7 @@ def _distances(
     """How far candidates lie from the prediction, infinite for none; and which are nearer when walked back, where the
     picture leaves that open."""
     forward = _distance(detections.contour_xy, predicted_n_contour)
-    backward = _distance(walked_back(detections.contour_xy), predicted_n_contour)
+    backward = _distance(reversed_direction(detections.contour_xy), predicted_n_contour)
     backward = torch.where(detections.direction_known, torch.inf, backward)
     distance = torch.where(detections.valid, torch.minimum(forward, backward), torch.inf)
     return distance, backward < forward
@@ -158,8 +158,8 @@ def _farthest_apart(alike: Float[Tensor, "m k 3"], usable: Bool[Tensor, "m k"], 
     return few[least.argmax()]
 
 
-def walked_back(contour_xy: Float[Tensor, "*batch 2 2 2"]) -> Float[Tensor, "*batch 2 2 2"]:
-    """Seen by somebody who walks the other way: the edges change sides and the points change order."""
+def reversed_direction(contour_xy: Float[Tensor, "*batch 2 2 2"]) -> Float[Tensor, "*batch 2 2 2"]:
+    """The same contours with the line directed the other way: the edges change sides and the points change order."""
     return contour_xy.flip(-3).flip(-2)
 
 

@@ -18,8 +18,10 @@ from rmis_calib.pipeline.next_pose import WHERE, pose_candidates
 from rmis_calib.results import STATUS_SENTENCES, CalibrationResult, Motions, Status
 from rmis_calib.solver import Problem, Solution, SolveStatus
 from rmis_calib.solver import solve as solve_problem
-from rmis_calib.solver.relinearise import scan_clock
-from rmis_calib.solver.solution import MotionReason, Nuisance, Observability, Rival
+from rmis_calib.solver.estimate.relinearise import scan_clock
+from rmis_calib.solver.observability import Observability
+from rmis_calib.solver.solution import AlternativeModel, Nuisance
+from rmis_calib.solver.status import MotionReason
 
 COARSE_CLOCK_STEP_S, CLOCK_STEP_S = 0.1, 0.02
 """Spacing of the clock offsets that are tried, first everywhere, then near the best: motion hardly turns within
@@ -121,12 +123,12 @@ def estimate_with_kinematics(
             clock_s = _clock_start(base, unknowns, config.clock_search_s, sigma)
     clock_at = sigma.new_full((1,), clock_s)
 
-    def solve_with(sigma: torch.Tensor, rival: Rival | None = None) -> Solution:
+    def solve_with(sigma: torch.Tensor, alternative: AlternativeModel | None = None) -> Solution:
         def kinematics(joint_offset: torch.Tensor, clock_s: torch.Tensor) -> Problem:
             return unknowns.linearised(base, joint_offset, clock_s, sigma)
 
         start = kinematics(torch.zeros_like(sigma)[None], clock_at)
-        return solve_problem(start.take_trials(0), config.solver, kinematics=kinematics, rival=rival)
+        return solve_problem(start.take_trials(0), config.solver, kinematics=kinematics, alternative=alternative)
 
     solution = solve_with(sigma)
     if "joint_offset" not in solution.nuisances:
@@ -144,7 +146,9 @@ def estimate_with_kinematics(
     note = _about_offsets(offsets, held, unknowns.columns, float(probability))
     if asked.joint_offsets == "always" or bool(offsets.log_odds_nominal < -STRONG_EVIDENCE):
         return solution, (note,)
-    return solve_with(sigma * 0.0, Rival(solution.camera_right_T_arm, solution.covariance, probability)), (note,)
+    return solve_with(sigma * 0.0, AlternativeModel(solution.camera_right_T_arm, solution.covariance, probability)), (
+        note,
+    )
 
 
 def _about_offsets(offsets: Nuisance, held: torch.Tensor, columns: tuple[str, ...], probability: float) -> str:
@@ -218,7 +222,7 @@ def make_result(
         camera_right_T_arm=_transform("camera_right", "arm", solution.camera_right_T_arm) if finite else None,
         camera_left_T_camera_right=None if stereo is None else _transform("camera_left", "camera_right", stereo),
         covariance=covariance if np.isfinite(covariance).all() else None,
-        observability=observability_record(solution.observability(), notes),
+        observability=observability_record(solution.observability.describe(), notes),
         motions=motions,
         residuals=residuals,
         nuisances=_nuisance_records(solution, joint_columns),
@@ -229,7 +233,7 @@ def make_result(
 def judge(solution: Solution) -> tuple[Status, str]:
     """Status and its one line: a solve that did not work first, then a model that does not fit, then sight."""
     status = SolveStatus(int(solution.status))
-    observability = solution.observability()
+    observability = solution.observability.describe()
     strange = _strange_unknown(solution)
     if status is not SolveStatus.CONVERGED:
         why = f"{STATUS_SENTENCES['solver_failed']}: {status.sentence}"

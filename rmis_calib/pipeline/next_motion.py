@@ -18,10 +18,9 @@ from rmis_calib.geometry.cameras import Camera
 from rmis_calib.io import Recording
 from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns, estimated_offsets
 from rmis_calib.solver import Problem, Solution, SolveStatus
-from rmis_calib.solver.advice import Advice, advise, measured_alike
-from rmis_calib.solver.observability import remedies
+from rmis_calib.solver.assess.next_motion import Advice, advise, measured_alike
+from rmis_calib.solver.observability import Verdict
 from rmis_calib.solver.settings import AdviceSettings
-from rmis_calib.solver.solution import Verdict
 
 VIEW_MARGIN = 0.05
 """Part of the picture's width and height that is left free on every side: the estimate is not exact."""
@@ -79,10 +78,10 @@ def advice_record(
     """
     if solution.posterior is None:
         return {}
-    point = solution.sight.working_point_mm[0]
+    point = solution.observability.working_point_mm[0]
     advice = advise(candidates.problem, solution.posterior, point, view, config.solver, candidates.effort)
-    trusted = solution.observability().verdict is Verdict.TRUSTWORTHY
-    general = () if trusted else remedies(solution.sight, 0)
+    trusted = solution.observability.describe().verdict is Verdict.TRUSTWORTHY
+    general = () if trusted else solution.observability.remedies()
     return {
         "advice": _sentences(solution, candidates, advice, where) + [f"In general: {words}." for words in general],
         "next_motions": [_values(candidates, advice, step) for step in range(len(advice.chosen))],
@@ -92,7 +91,7 @@ def advice_record(
 def _sentences(solution: Solution, candidates: Candidates, advice: Advice, where: str) -> list[str]:
     if not len(advice.chosen):
         return [f"The present estimate predicts no motion {where} that would keep the shaft in view."]
-    reported_mm, name = solution.observability().directions[0]
+    reported_mm, name = solution.observability.describe().directions[0]
     sigma = [_mm(value) for value in advice.weakest_mm.tolist()]
     out = []
     for step, index in enumerate(advice.chosen.tolist()):

@@ -16,7 +16,7 @@ from rmis_calib.geometry.rigid import rigid_from_rotation_translation, rigid_inv
 from rmis_calib.geometry.rotations import rotvec_to_matrix
 from rmis_calib.pipeline.next_motion import Candidates, joined
 from rmis_calib.solver import Problem, Solution
-from rmis_calib.solver.advice import measured_alike
+from rmis_calib.solver.assess.next_motion import measured_alike
 from rmis_calib.solver.settings import AdviceSettings
 
 PIVOT_BEHIND_MM = 120.0

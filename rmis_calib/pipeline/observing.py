@@ -9,7 +9,7 @@ from rmis_calib.config import CalibrationConfig
 from rmis_calib.geometry.lines import contour_planes
 from rmis_calib.geometry.rigid import rotate_vectors, transform_points
 from rmis_calib.io import Recording, ShaftObservations
-from rmis_calib.pipeline.choosing import Choice, walked_back
+from rmis_calib.pipeline.choosing import Choice, reversed_direction
 from rmis_calib.pipeline.detection import View
 from rmis_calib.pipeline.poses import MotionPoses
 from rmis_calib.vision import FrameReason, ShaftDetections
@@ -118,7 +118,7 @@ def _measured(side: str, detections: ShaftDetections, choice: Choice, floor: flo
         return torch.where(valid.reshape(-1, *[1] * (value.ndim - 1)), value, torch.nan).cpu().numpy()
 
     contour, axis, sigma = pick("contour_xy"), pick("axis_xy"), pick("contour_sigma")
-    contour = torch.where(turned[:, None, None, None], walked_back(contour), contour)
+    contour = torch.where(turned[:, None, None, None], reversed_direction(contour), contour)
     axis = torch.where(turned[:, None, None], axis.flip(-2), axis)
     sigma = torch.where(turned[:, None], sigma.flip(-1), sigma)
     has_end = choice.taken & pick("end_valid") & ~turned

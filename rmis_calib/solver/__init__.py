@@ -5,14 +5,14 @@ from rmis_calib._lazy import lazy_exports
 __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
-        "LineStatistics": ".statistics",
+        "LineStatistics": ".start.line_statistics",
         "NoiseLevels": ".problem",
         "Problem": ".problem",
-        "MotionReason": ".solution",
+        "MotionReason": ".status",
         "Solution": ".solution",
         "SolverSettings": ".settings",
-        "SolveStatus": ".solution",
-        "Verdict": ".solution",
+        "SolveStatus": ".status",
+        "Verdict": ".observability",
         "solve": ".api",
     },
 )

@@ -7,17 +7,18 @@ from jaxtyping import Int
 from torch import Tensor
 
 from rmis_calib.errors import InputError, InsufficientDataError, ObservationsError
-from rmis_calib.solver.assemble import CHECKED_MOTIONS, SHOWN_MOTIONS, joint_solution, two_step_solution
-from rmis_calib.solver.design import motion_information, thin
-from rmis_calib.solver.initialise import find_candidates
-from rmis_calib.solver.joint import solve_joint
-from rmis_calib.solver.measurements import pack
-from rmis_calib.solver.paper import average, empirical_covariance, influence, solve_paper
+from rmis_calib.solver.assess.assemble import CHECKED_MOTIONS, SHOWN_MOTIONS, joint_solution, two_step_solution
+from rmis_calib.solver.assess.information import motion_information, select_d_optimal
+from rmis_calib.solver.estimate.map_estimate import solve_joint
+from rmis_calib.solver.estimate.relinearise import Kinematics, solve_relinearised
+from rmis_calib.solver.model.measurement_rows import pack
 from rmis_calib.solver.problem import MIN_MOTIONS, Problem
-from rmis_calib.solver.relinearise import Kinematics, solve_relinearised
 from rmis_calib.solver.settings import SolverSettings
-from rmis_calib.solver.solution import MotionReason, Rival, Solution, concatenate, map_tensors
-from rmis_calib.solver.statistics import LineStatistics
+from rmis_calib.solver.solution import AlternativeModel, Solution, concatenate, map_tensors
+from rmis_calib.solver.start.candidates import find_candidates
+from rmis_calib.solver.start.line_statistics import LineStatistics
+from rmis_calib.solver.start.paper import average, empirical_covariance, influence, solve_paper
+from rmis_calib.solver.status import MotionReason
 
 GROUP_MOTIONS = 32768
 """Motions (times trials) that are solved together: a batch of trials is cut into groups whose tensors stay in the
@@ -29,7 +30,7 @@ def solve(
     settings: SolverSettings | None = None,
     method: str | None = None,
     kinematics: Kinematics | None = None,
-    rival: Rival | None = None,
+    alternative: AlternativeModel | None = None,
 ) -> Solution:
     """Estimates `camera_right_T_arm` of every trial.
 
@@ -38,7 +39,7 @@ def solve(
         settings: defaults when absent.
         method: overrides the settings' method.
         kinematics: evaluates both arms at joint and clock offsets (relinearise.py); with it, `joint` iterates on them.
-        rival: the answer of another model, which the covariance of `joint` then allows for.
+        alternative: the answer of another model, which the covariance of `joint` then allows for.
 
     Raises:
         ObservationsError: values that are not finite where they must be, or rotations that are not rotations.
@@ -46,19 +47,23 @@ def solve(
     """
     settings = settings or SolverSettings()
     with torch.inference_mode():  # no graph is kept: a fifth of the time of 1,728 motions
-        solution = _solve_groups(problem.flatten_batch(), settings, method or settings.method, kinematics, rival)
+        solution = _solve_groups(problem.flatten_batch(), settings, method or settings.method, kinematics, alternative)
     return _shaped(solution, problem.batch_shape)
 
 
 def _solve_groups(
-    flat: Problem, settings: SolverSettings, method: str, kinematics: Kinematics | None, rival: Rival | None
+    flat: Problem,
+    settings: SolverSettings,
+    method: str,
+    kinematics: Kinematics | None,
+    alternative: AlternativeModel | None,
 ) -> Solution:
     """All trials, in groups where they are many."""
     _check(flat)
     count = max(1, GROUP_MOTIONS // flat.n_motions)
-    alone = kinematics is not None or rival is not None or settings.thin_to is not None
+    alone = kinematics is not None or alternative is not None or settings.thin_to is not None
     if flat.n_trials <= count or alone:
-        return _solve_flat(flat, settings, method, kinematics, rival)
+        return _solve_flat(flat, settings, method, kinematics, alternative)
     groups = [
         _solve_flat(flat.take_trials(slice(b, b + count)), replace(settings, seed=settings.seed + b), method)
         for b in range(0, flat.n_trials, count)
@@ -71,7 +76,7 @@ def _solve_flat(
     settings: SolverSettings,
     method: str,
     kinematics: Kinematics | None = None,
-    rival: Rival | None = None,
+    alternative: AlternativeModel | None = None,
 ) -> Solution:
     """Trials that are solved together, checked before."""
     if method != "joint":
@@ -81,7 +86,7 @@ def _solve_flat(
         index, kept = _informative(flat, settings, settings.thin_to)
         chosen = flat.select_motions(index)
     fit = solve_joint(chosen, settings) if kinematics is None else solve_relinearised(chosen, settings, kinematics)
-    solution = joint_solution(fit, settings, rival)
+    solution = joint_solution(fit, settings, alternative)
     return solution if index is None else replace(_spread(solution, index, flat.n_motions), information_kept=kept)
 
 
@@ -124,7 +129,7 @@ def _informative(flat: Problem, settings: SolverSettings, count: int) -> tuple[I
             for n in range(0, flat.n_motions, settings.chunk)
         ]
     )
-    return thin(information, torch.diag(first.layout.sigma[0].square().reciprocal()), count)
+    return select_d_optimal(information, torch.diag(first.layout.sigma[0].square().reciprocal()), count)
 
 
 def _spread(solution: Solution, index: Int[Tensor, " k"], n: int) -> Solution:
@@ -164,7 +169,7 @@ def _shaped(solution: Solution, batch: torch.Size) -> Solution:
     def shaped(value: Tensor) -> Tensor:
         return value.clone().reshape((*batch, *value.shape[1:]))
 
-    flat = ("sight", "posterior", "history")
+    flat = ("observability", "posterior", "history")
     return replace(
         solution,
         **{name: map_tensors(item, torch.clone if name in flat else shaped) for name, item in vars(solution).items()},

@@ -54,8 +54,8 @@ class Problem:
         camera_T_camera_right: identity, then (with two cameras) `camera_left_T_camera_right`.
         axis_xy: two points of the axis line, RCM side first, [camera, motion, point, xy].
         axis_sigma: 1 sigma of each of these points across the line; NaN: the image noise.
-        contour_xy: [camera, motion, edge, point, xy]; edge 0 on the left-hand side of somebody who walks from the RCM
-            side to the tip.
+        contour_xy: [camera, motion, edge, point, xy]; edge 0 left of the axis, directed from the RCM side
+            to the tip.
         contour_sigma: [camera, motion, edge].
         end_xy: the shaft's end on the axis; only its place along the axis is used.
         end_sigma: along the axis.

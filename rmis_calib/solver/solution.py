@@ -2,78 +2,17 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass, replace
-from enum import IntEnum, StrEnum
 from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from rmis_calib.solver.normal import NoiseModel
-from rmis_calib.solver.residuals import State
-from rmis_calib.solver.unknowns import Layout
-
-
-class SolveStatus(IntEnum):
-    """How a solve ended. `.sentence` says it in words."""
-
-    CONVERGED = 0
-    MAX_ITERATIONS = 1
-    STALLED = 2
-    NON_FINITE = 3
-    SINGULAR = 4
-    BEHIND_CAMERA = 5
-    INCONSISTENT = 6
-    MISFIT = 7
-
-    @property
-    def sentence(self) -> str:
-        return _SENTENCES[self]
-
-
-_SENTENCES = {
-    SolveStatus.CONVERGED: "converged",
-    SolveStatus.MAX_ITERATIONS: "ran out of steps before the estimate settled",
-    SolveStatus.STALLED: "no step improved the fit although it had not settled",
-    SolveStatus.NON_FINITE: "a residual became infinite or undefined",
-    SolveStatus.SINGULAR: "the measurements leave a direction of the unknown entirely free",
-    SolveStatus.BEHIND_CAMERA: "the best fit puts the shaft behind the camera or its tip on the wrong side",
-    SolveStatus.MISFIT: "the residuals are larger than the noise levels explain",
-    SolveStatus.INCONSISTENT: (
-        "a camera has more measurements that contradict the transform than agree with it (are the cameras swapped?)"
-    ),
-}
-
-
-class Verdict(StrEnum):
-    """Whether the predicted error at the working point is small enough to use the result."""
-
-    TRUSTWORTHY = "trustworthy"
-    WEAK = "weak"
-    UNOBSERVABLE = "unobservable"
-
-
-class MotionReason(IntEnum):
-    """Why a motion was or was not used."""
-
-    USED = 0
-    NOT_MEASURED = 1
-    OUTLIER = 2
-    OUTLIER_ONE_CAMERA = 3
-    THINNED = 4
-
-    @property
-    def sentence(self) -> str:
-        return _REASONS[self]
-
-
-_REASONS = {
-    MotionReason.USED: "used",
-    MotionReason.NOT_MEASURED: "no camera measured the shaft",
-    MotionReason.OUTLIER: "does not fit the other motions",
-    MotionReason.OUTLIER_ONE_CAMERA: "used from one camera; the other camera's measurement does not fit",
-    MotionReason.THINNED: "left out: other motions carry nearly all the information",
-}
+from rmis_calib.solver.model.normal_equations import NoiseModel
+from rmis_calib.solver.model.parameters import ParameterLayout
+from rmis_calib.solver.model.residuals import State
+from rmis_calib.solver.observability import ObservabilityTensors
+from rmis_calib.solver.status import SolveStatus
 
 
 @dataclass(frozen=True)
@@ -91,60 +30,12 @@ class Nuisance:
 
 
 @dataclass(frozen=True)
-class Rival:
+class AlternativeModel:
     """The answer of another model of the same data, and the probability that it is that model which is right."""
 
     camera_right_T_arm: Float[Tensor, "*batch 4 4"]
     covariance: Float[Tensor, "*batch 6 6"]
     probability: Float[Tensor, "*batch"]
-
-
-@dataclass(frozen=True)
-class Observability:
-    """What the data can see, for one trial.
-
-    Attributes:
-        verdict: from the predicted errors and the thresholds of the settings.
-        working_point_mm: where the error counts, in `camera_right`.
-        working_point_sigma_mm: predicted error there, root of the trace.
-        rotation_sigma_deg: predicted rotation error, root of the trace.
-        directions: the principal directions, worst first: (1 sigma in mm at the working point, sentence).
-        degeneracies: names of the classical degenerate cases that were recognised.
-        sentence: one line for a report.
-    """
-
-    verdict: Verdict
-    working_point_mm: tuple[float, float, float]
-    working_point_sigma_mm: float
-    rotation_sigma_deg: float
-    directions: tuple[tuple[float, str], ...]
-    degeneracies: tuple[str, ...]
-    sentence: str
-
-
-@dataclass(frozen=True)
-class Sight:
-    """Observability of every trial, as tensors.
-
-    Attributes:
-        working_point_mm: where the error counts, in `camera_right`.
-        working_point_sigma_mm: predicted error there, root of the trace.
-        rotation_sigma_deg: predicted rotation error, root of the trace.
-        sigma_mm: 1 sigma along the principal directions, worst first.
-        directions: principal directions of (lever * dphi, displacement of the working point).
-        verdict: 0 trustworthy, 1 weak, 2 unobservable.
-        degeneracy: flags (`observability.Degeneracy`).
-        shaft_direction: mean direction of the shaft, in `camera_right`.
-    """
-
-    working_point_mm: Float[Tensor, "b 3"]
-    working_point_sigma_mm: Float[Tensor, " b"]
-    rotation_sigma_deg: Float[Tensor, " b"]
-    sigma_mm: Float[Tensor, "b 6"]
-    directions: Float[Tensor, "b 6 6"]
-    verdict: Int[Tensor, " b"]
-    degeneracy: Int[Tensor, " b"]
-    shaft_direction: Float[Tensor, "b 3"]
 
 
 @dataclass(frozen=True)
@@ -159,7 +50,7 @@ class Posterior:
     """
 
     state: State
-    layout: Layout
+    layout: ParameterLayout
     noise: NoiseModel
     information: Float[Tensor, "b p p"]
 
@@ -185,9 +76,8 @@ class Solution:
         noise: levels that were used, name -> value (`image`, `ends`, `heads` as factors on the nominal ones).
         nuisances: by name.
         bias: correction that was subtracted from (rotation, translation); zero when none.
-        sight: what the data can see, flat over trials (observability.py); `observability(trial)` puts one trial into
-            words.
-        posterior: what further motions would add to (design.py); None for methods that estimate no noise.
+        observability: what the data can see, flat over trials; its `describe(trial)` puts one trial into words.
+        posterior: what further motions would add to (assess/information.py); None for methods that estimate no noise.
         history: cost of accepted iterates of the refinement.
         information_kept: part of the information (per parameter, geometric mean) that thinning kept; 1 without.
     """
@@ -208,7 +98,7 @@ class Solution:
     noise: dict[str, Float[Tensor, "*batch"]]
     nuisances: dict[str, Nuisance]
     bias: Float[Tensor, "*batch 6"]
-    sight: Sight
+    observability: ObservabilityTensors
     posterior: Posterior | None = None
     history: tuple[Float[Tensor, "..."], ...] = ()
     information_kept: float = 1.0
@@ -223,16 +113,10 @@ class Solution:
         """Root of the trace of the translation block."""
         return self.covariance[..., 3:, 3:].diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
 
-    def observability(self, trial: int = 0) -> Observability:
-        """What the data of one trial (flat index) can see, in words."""
-        from rmis_calib.solver.observability import describe
-
-        return describe(self.sight, trial)
-
     @property
     def verdict(self) -> Int[Tensor, "*batch"]:
         """0 trustworthy, 1 weak, 2 unobservable; a solve that did not converge is never better than unobservable."""
-        verdict = self.sight.verdict.view_as(self.status)
+        verdict = self.observability.verdict.view_as(self.status)
         return torch.where(self.converged, verdict, 2)
 
     @property

@@ -1,24 +1,55 @@
 """What the detector says of a batch of pictures, and how two looks at the same picture become one answer."""
 
 from dataclasses import dataclass, replace
+from enum import IntEnum
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-
-from rmis_calib.vision.reasons import FrameReason
 
 # Score, as a fraction of the picture's width, from which a strip may be a shaft that this view does not show well: in
 # pictures of the plain presets what lies beside the shafts scores less in nine of ten, in `hard` missed shafts do not.
 _LEAD = 0.04
 
 
+class FrameReason(IntEnum):
+    """Outcome of one frame; `sentence` is what a report prints."""
+
+    OK = 0
+    BAD_PIXELS = 1
+    NO_PICTURE = 2
+    NO_STRAIGHT_EDGES = 3
+    NOT_A_CYLINDER = 4
+    TOO_SHORT = 5
+    EDGES_UNCLEAR = 6
+    AMBIGUOUS = 7
+    LEFT_OUT = 8
+
+    @property
+    def sentence(self) -> str:
+        """The reason in words."""
+        return _SENTENCES[self]
+
+
+_SENTENCES = {
+    FrameReason.OK: "a shaft was found",
+    FrameReason.BAD_PIXELS: "the frame has values that are not finite numbers",
+    FrameReason.NO_PICTURE: "the frame is black, white or of one tone: nothing can be told apart in it",
+    FrameReason.NO_STRAIGHT_EDGES: "no straight edges stand out",
+    FrameReason.NOT_A_CYLINDER: "no two edges enclose a strip that differs from both sides, as a shaft does",
+    FrameReason.TOO_SHORT: "what looks like a shaft is too short, or never reaches the border of the picture",
+    FrameReason.EDGES_UNCLEAR: "too few sub-pixel edge points agree on two straight lines",
+    FrameReason.AMBIGUOUS: "a strip was found, but its confidence is below the accepted minimum",
+    FrameReason.LEFT_OUT: "the frame was left out: only every n-th was to be searched",
+}
+
+
 @dataclass(frozen=True, eq=False)
 class ShaftDetections:
     """Up to k shafts a frame, best first.
 
-    Convention: normalised undistorted coordinates (x/z, y/z); without a camera they are pixels. Edge 0 is on the left
-    of somebody who walks in the picture from the RCM side to the tip; points run in that direction. Where `valid` is
+    Convention: normalised undistorted coordinates (x/z, y/z); without a camera they are pixels. Edge 0 is left of the
+    axis, directed in the picture from the RCM side to the tip; points run in that direction. Where `valid` is
     false everything else is NaN or false.
     """
 
@@ -60,7 +91,7 @@ class ShaftDetections:
         return replace(self, **{name: value[rows, order] for name, value in vars(self).items() if value.ndim > 1})
 
 
-def unresolved(found: ShaftDetections, leads: Float[Tensor, "b k"], sure: float) -> Bool[Tensor, " b"]:
+def needs_second_pass(found: ShaftDetections, leads: Float[Tensor, "b k"], sure: float) -> Bool[Tensor, " b"]:
     """Pictures without a sure shaft, with one that is not sure, or with more that looks like one.
 
     Args:
@@ -74,7 +105,7 @@ def unresolved(found: ShaftDetections, leads: Float[Tensor, "b k"], sure: float)
     return (count[:, 0] == 0) | (found.valid & ~is_sure).any(1) | (beyond & (leads > _LEAD)).any(1)
 
 
-def with_more(first: ShaftDetections, second: ShaftDetections, sure: float) -> ShaftDetections:
+def merge(first: ShaftDetections, second: ShaftDetections, sure: float) -> ShaftDetections:
     """The sure shafts of a first look, and of a second one what does not lie on them; as many as each look holds."""
     keep = first.valid & (first.confidence >= sure)
     known = _lies_on(second, first) | _lies_on(first, second).mT

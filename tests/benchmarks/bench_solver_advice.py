@@ -22,8 +22,8 @@ from torch import Tensor
 from data_synth.lines import simulate_lines
 from data_synth.scene import build_scene
 from rmis_calib.solver import Problem, Solution, SolverSettings, solve
-from rmis_calib.solver.advice import Advice, advise, measured_alike
-from rmis_calib.solver.observability import carried
+from rmis_calib.solver.assess.next_motion import Advice, advise, measured_alike
+from rmis_calib.solver.assess.observability import working_point_jacobian
 from rmis_calib.solver.settings import AdviceSettings
 from tests.benchmarks.solver_common import REALISTIC, config, errors
 
@@ -85,7 +85,7 @@ def next_motion(
     base = measured_alike(problem, len(candidates))
     at = replace(base, **{key: getattr(at, key) for key in ("arm_T_rcm", "rcm_v_axis", "rcm_s_end_mm", "rcm_p_head")})
     view = torch.tensor([VIEW] * weak.cameras, dtype=torch.float64)
-    point = solution.sight.working_point_mm[0]
+    point = solution.observability.working_point_mm[0]
     return advise(at, solution.posterior, point, view, settings), solution
 
 
@@ -95,9 +95,9 @@ def left(weak: Weak, unit: np.ndarray, trials: int, settings: SolverSettings = S
     problem, truth = measure(weak, unit, trials, seed=1)
     solution = solve(problem, settings)
     t = solution.camera_right_T_arm[:, :3, 3]
-    A = carried(t, solution.sight.working_point_mm, settings.verdict.lever_mm)
+    A = working_point_jacobian(t, solution.observability.working_point_mm, settings.verdict.lever_mm)
     error = (A @ errors(solution.camera_right_T_arm, truth)[..., None])[..., 0]
-    return float(solution.sight.sigma_mm[:, 0].median()), float(error.square().sum(-1).median().sqrt())
+    return float(solution.observability.sigma_mm[:, 0].median()), float(error.square().sum(-1).median().sqrt())
 
 
 def main() -> None:

@@ -23,14 +23,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import torch
 
 from rmis_calib.solver import SolverSettings
-from rmis_calib.solver.bias import _Draws, _turned, simulate
-from rmis_calib.solver.joint import JointFit, solve_joint
-from rmis_calib.solver.measurements import Packed
-from rmis_calib.solver.normal import NoiseModel, covariance, image_variance
-from rmis_calib.solver.refine import solve_system
-from rmis_calib.solver.residuals import State, linearise
-from rmis_calib.solver.soa import batch_last, dot, rotate, rotate_back, unit
-from rmis_calib.solver.unknowns import Layout, columns
+from rmis_calib.solver.estimate.bias import _Draws, _turned, simulate
+from rmis_calib.solver.estimate.gauss_newton import solve_system
+from rmis_calib.solver.estimate.map_estimate import JointFit, solve_joint
+from rmis_calib.solver.model.batched_linalg import batch_last, dot, rotate, rotate_back, unit
+from rmis_calib.solver.model.measurement_rows import MeasurementRows
+from rmis_calib.solver.model.normal_equations import NoiseModel, covariance, image_variance
+from rmis_calib.solver.model.parameters import ParameterLayout, columns
+from rmis_calib.solver.model.residuals import State, linearise
 from tests.benchmarks.solver_common import (
     KNOWN_RADIUS,
     REALISTIC,
@@ -52,7 +52,7 @@ CELLS = [
 STEPS = 8
 
 
-def gauss_helmert(packed: Packed, state: State, layout: Layout, noise: NoiseModel) -> State:
+def gauss_helmert(packed: MeasurementRows, state: State, layout: ParameterLayout, noise: NoiseModel) -> State:
     """Transform and latent poses together: each step solves the rows linearised at the latent poses, then moves
     these."""
     shift, turn = torch.zeros_like(packed.p), torch.zeros_like(packed.p)

@@ -22,7 +22,7 @@ from data_synth.scene import Scene, build_scene, poses_at
 from data_synth.settings import LineStudyConfig
 from rmis_calib.geometry.rotations import matrix_to_rotvec
 from rmis_calib.solver import Problem, SolverSettings, solve
-from rmis_calib.solver.relinearise import scan_clock
+from rmis_calib.solver.estimate.relinearise import scan_clock
 from rmis_calib.solver.settings import UnknownSettings
 from tests.benchmarks.solver_common import REALISTIC, config, errors, rms, rotation_deg, translation_mm
 

@@ -17,10 +17,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import torch
 
 from rmis_calib.solver import LineStatistics, Problem, SolverSettings, solve
-from rmis_calib.solver.initialise import find_candidates
-from rmis_calib.solver.measurements import pack
-from rmis_calib.solver.residuals import linearise, residual_rows
-from rmis_calib.solver.unknowns import Nominal, columns, initial_state, make_layout
+from rmis_calib.solver.model.measurement_rows import pack
+from rmis_calib.solver.model.parameters import NuisancePriors, columns, initial_state, make_layout
+from rmis_calib.solver.model.residuals import linearise, residual_rows
+from rmis_calib.solver.start.candidates import find_candidates
 from tests.benchmarks.solver_common import (
     KNOWN_RADIUS,
     REALISTIC,
@@ -86,8 +86,8 @@ def show_jacobians(trial: Study, settings: SolverSettings) -> None:
     packed = pack(problem, settings.noise)
     found = solve(problem, settings)
     X, end_offset = found.camera_right_T_arm, found.nuisances["end_offset"].value[:, 0]
-    state = replace(initial_state(Nominal.of(problem), X[:, :3, :3], X[:, :3, 3]), end_offset=end_offset)
-    layout = make_layout(Nominal.of(problem), packed, state, settings.unknowns, settings.noise)
+    state = replace(initial_state(NuisancePriors.of(problem), X[:, :3, :3], X[:, :3, 3]), end_offset=end_offset)
+    layout = make_layout(NuisancePriors.of(problem), packed, state, settings.unknowns, settings.noise)
     single = packed.gather(torch.zeros(packed.motions, dtype=torch.int64), torch.arange(packed.motions))
     each = state.take(torch.zeros(packed.motions, dtype=torch.int64))
 

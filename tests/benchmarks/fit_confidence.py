@@ -18,7 +18,8 @@ from bench_vision_render import rms_px
 from data_synth import load_synth_config, render_frames
 from data_synth.world import build_world
 from rmis_calib.geometry import Camera
-from rmis_calib.vision import DetectorSettings, ShaftDetections, ShaftDetector, confidence
+from rmis_calib.vision import DetectorSettings, ShaftDetections, ShaftDetector
+from rmis_calib.vision.fine import confidence
 
 PRESETS = (
     "absent", "carbon", "blood", "hard", "brutal", "cholec", "two_instruments", "clean", "mild", "tissue", "smoke",
@@ -33,7 +34,7 @@ class Recorder:
 
     def __init__(self) -> None:
         self.rows: list[tuple[float, list[float]]] = []
-        self._chance = confidence.chance
+        self._chance = confidence.probability
 
     def __call__(self, of: tuple[torch.Tensor, ...]) -> torch.Tensor:
         value = self._chance(of)

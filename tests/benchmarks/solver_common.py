@@ -13,11 +13,11 @@ from data_synth.lines import simulate_lines
 from data_synth.settings import LineStudyConfig
 from rmis_calib.geometry.rotations import matrix_to_rotvec
 from rmis_calib.solver import Problem, SolverSettings
-from rmis_calib.solver.measurements import pack
-from rmis_calib.solver.normal import accumulate
+from rmis_calib.solver.estimate.noise_levels import assumed_noise
+from rmis_calib.solver.model.measurement_rows import pack
+from rmis_calib.solver.model.normal_equations import accumulate
+from rmis_calib.solver.model.parameters import NuisancePriors, initial_state, make_layout
 from rmis_calib.solver.settings import UnknownSettings
-from rmis_calib.solver.unknowns import Nominal, initial_state, make_layout
-from rmis_calib.solver.variance import assumed_noise
 
 KNOWN_RADIUS = UnknownSettings(radius_sigma_relative=0.0)
 """The simulation's radius is exact."""
@@ -78,10 +78,10 @@ def study(
     solver = SolverSettings(unknowns=unknowns)
     packed = pack(clean, solver.noise)
     state = replace(
-        initial_state(Nominal.of(clean), X[:, :3, :3], X[:, :3, 3]),
+        initial_state(NuisancePriors.of(clean), X[:, :3, :3], X[:, :3, 3]),
         end_offset=torch.full_like(X[:, 0, 0], truth["shaft_end_offset_mm"]),
     )
-    layout = make_layout(Nominal.of(clean), packed, state, unknowns, solver.noise)
+    layout = make_layout(NuisancePriors.of(clean), packed, state, unknowns, solver.noise)
     noise, _ = assumed_noise(clean, solver.noise)
     information = accumulate(packed, state, layout, noise, solver.chunk).H
     return Study(problem, X, torch.linalg.inv(information)[:, :6, :6])

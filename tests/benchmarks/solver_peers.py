@@ -22,11 +22,11 @@ from scipy.spatial.transform import Rotation
 
 from rmis_calib.geometry.rotations import matrix_to_rotvec, skew
 from rmis_calib.solver import Problem, SolverSettings
-from rmis_calib.solver.measurements import pack
-from rmis_calib.solver.normal import covariance, image_variance
-from rmis_calib.solver.residuals import State, linearise, residual_rows
-from rmis_calib.solver.unknowns import Nominal, columns, initial_state, make_layout
-from rmis_calib.solver.variance import assumed_noise
+from rmis_calib.solver.estimate.noise_levels import assumed_noise
+from rmis_calib.solver.model.measurement_rows import pack
+from rmis_calib.solver.model.normal_equations import covariance, image_variance
+from rmis_calib.solver.model.parameters import NuisancePriors, columns, initial_state, make_layout
+from rmis_calib.solver.model.residuals import State, linearise, residual_rows
 
 Rows = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -134,7 +134,7 @@ class AnalyticPeer:
 
     def __init__(self, problem: Problem, settings: SolverSettings, start: torch.Tensor, end_offset: float) -> None:
         self.packed = pack(problem, settings.noise)
-        nominal = Nominal.of(problem)
+        nominal = NuisancePriors.of(problem)
         zero = initial_state(nominal, start[None, :3, :3], start[None, :3, 3])
         self.layout = make_layout(nominal, self.packed, zero, settings.unknowns, settings.noise)
         self.origin = replace(zero, end_offset=torch.full((1,), end_offset, dtype=torch.float64))

@@ -50,9 +50,7 @@ def test_point_line_distance_is_the_distance() -> None:
 
 def test_convention_a_line_is_positive_on_the_right_hand_side() -> None:
     a, b = torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=torch.float64)
-    below = torch.tensor(
-        [0.5, 0.2], dtype=torch.float64
-    )  # y is down: the right hand of somebody who walks to the right
+    below = torch.tensor([0.5, 0.2], dtype=torch.float64)  # y is down: right of a line directed to the right
     # Counter-literal: with y up, or with b x a, it would be -0.2.
     assert float(g.point_line_distance(below, g.line_through_points(a, b))) == pytest.approx(0.2)
     assert float(g.plane_normal_from_points(a, b)[1]) == pytest.approx(1.0)

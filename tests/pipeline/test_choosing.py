@@ -14,11 +14,11 @@ from rmis_calib.errors import InputError
 from rmis_calib.geometry.lines import contour_planes
 from rmis_calib.pipeline.calibration import run_calibration
 from rmis_calib.pipeline.choosing import (
+    association_gate,
     choices_by_instrument,
     consistent_choice,
     first_choice,
     pointed_at,
-    reach_of,
 )
 from rmis_calib.pipeline.observing import select_frames
 from rmis_calib.pipeline.starting import first_choices, read_prior
@@ -103,14 +103,14 @@ def test_the_candidate_that_fits_the_kinematics_wins_over_confidence(predicted):
 
 
 def test_an_unknown_direction_is_taken_as_it_fits(predicted):
-    walked_back = contour_points(*OURS).flip(0).flip(1)  # the edges change sides, the points change order
-    choice = consistent_choice(detections([walked_back], [False]), predicted)
+    reversed_direction = contour_points(*OURS).flip(0).flip(1)  # the edges change sides, the points change order
+    choice = consistent_choice(detections([reversed_direction], [False]), predicted)
     assert (choice.candidate.tolist(), choice.reversed.tolist()) == ([0], [True])
 
 
 def test_a_known_direction_is_never_turned(predicted):
-    walked_back = contour_points(*OURS).flip(0).flip(1)
-    choice = consistent_choice(detections([walked_back], [True]), predicted)
+    reversed_direction = contour_points(*OURS).flip(0).flip(1)
+    choice = consistent_choice(detections([reversed_direction], [True]), predicted)
     assert choice.reversed.tolist() == [False]
 
 
@@ -130,10 +130,10 @@ def test_reach_follows_from_the_candidates_that_were_used(predicted):
     beside = ([p[0] + 3.0, p[1], p[2]], v)
     both = together([detections([contour_points(*OURS)], [True]), detections([contour_points(*beside)], [True])])
     twice, choice = predicted.expand(2, -1, -1), first_choice(both)
-    near = reach_of(choice, both, twice, torch.tensor([True, False]))
-    far = reach_of(choice, both, twice, torch.tensor([True, True]))
+    near = association_gate(choice, both, twice, torch.tensor([True, False]))
+    far = association_gate(choice, both, twice, torch.tensor([True, True]))
     assert 0.01 < near < 0.03 < far
-    assert reach_of(choice, both, twice, torch.tensor([False, False])) == torch.inf
+    assert association_gate(choice, both, twice, torch.tensor([False, False])) == torch.inf
 
 
 def together(frames):

@@ -110,7 +110,7 @@ def test_readings_keep_the_shaft_in_the_true_camera(weak):
 def test_words_name_joints_readings_and_what_is_gained(weak):
     candidates, record, solution = advised(weak)
     first, motion = record["advice"][0], record["next_motions"][0]
-    assert solution.observability().directions[0][1] in first
+    assert solution.observability.describe().directions[0][1] in first
     assert candidates.joints is not None
     index = candidates.words.index(motion["words"])
     assert motion["words"] in first
@@ -121,7 +121,7 @@ def test_words_name_joints_readings_and_what_is_gained(weak):
         value = motion["joints"][f"{arm}.{joint}_{'mm' if unit == 'mm' else 'rad'}"]
         assert float(after) == pytest.approx(value if unit == "mm" else np.rad2deg(value), abs=0.06)
     sigmas = [motion["weakest_sigma_mm"] for motion in record["next_motions"]]
-    assert sigmas[0] < 0.5 * solution.observability().directions[0][0]
+    assert sigmas[0] < 0.5 * solution.observability.describe().directions[0][0]
     assert sigmas == sorted(sigmas, reverse=True)
     json.dumps(record, allow_nan=False)
 
@@ -130,7 +130,7 @@ def test_axis_lines_of_a_still_laparoscope_need_the_laparoscope_to_move(weak):
     """Without a radius the instrument alone can never tell the translation along the view."""
     config = parse_config({"measurements": ["axis"], "solver": {"advice": {"motions": 1}}})
     _, record, solution = advised(weak, config)
-    assert "STATIC_LAPAROSCOPE" in solution.observability().degeneracies
+    assert "STATIC_LAPAROSCOPE" in solution.observability.describe().degeneracies
     assert all("laparoscope." in motion["words"] for motion in record["next_motions"])
     assert "In general: move the laparoscope's arm as well, with its joints logged." in record["advice"]
 

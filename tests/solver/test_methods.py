@@ -8,10 +8,10 @@ import torch
 from rmis_calib.geometry.rotations import quat_to_matrix, random_quat, rotation_angle
 from rmis_calib.solver import LineStatistics, Problem, SolverSettings, SolveStatus, Verdict, solve
 from rmis_calib.solver.observability import VERDICTS
-from rmis_calib.solver.paper import linear_rotation, quaternion_derivatives, solve_paper
-from rmis_calib.solver.rotation_search import vec
 from rmis_calib.solver.settings import NoiseSettings, UnknownSettings
 from rmis_calib.solver.solution import concatenate
+from rmis_calib.solver.start.paper import linear_rotation, quaternion_derivatives, solve_paper
+from rmis_calib.solver.start.rotation_search import vec
 
 EXACT = UnknownSettings(radius_sigma_relative=0.0)
 
@@ -145,7 +145,7 @@ def test_groups_of_trials_are_solved_as_one_batch(simulate, realistic, method, m
         torch.testing.assert_close(getattr(grouped, name), getattr(whole, name), equal_nan=True, rtol=1e-3, atol=1e-7)
     assert grouped.status.tolist() == whole.status.tolist()
     assert grouped.noise.keys() == whole.noise.keys() and grouped.nuisances.keys() == whole.nuisances.keys()
-    assert grouped.sight.sigma_mm.shape == whole.sight.sigma_mm.shape
+    assert grouped.observability.sigma_mm.shape == whole.observability.sigma_mm.shape
 
 
 def test_an_unknown_that_some_trials_lack_is_held_in_them(simulate, realistic):

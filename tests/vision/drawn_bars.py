@@ -9,7 +9,7 @@ from scipy.special import ndtr
 
 @dataclass(frozen=True)
 class Bar:
-    """A drawn shaft: `centre` on its axis, unit `along` towards the tip, unit `left` of somebody who walks that way."""
+    """A drawn shaft: `centre` on its axis, unit `along` towards the tip, unit `left` of that direction."""
 
     image: np.ndarray
     centre: np.ndarray

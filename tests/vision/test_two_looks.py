@@ -13,7 +13,7 @@ from data_synth.truth import side_truth
 from data_synth.world import build_world
 from rmis_calib.geometry import Camera
 from rmis_calib.vision import DetectorSettings, FrameReason, ShaftDetections, ShaftDetector
-from rmis_calib.vision.detections import unresolved, with_more
+from rmis_calib.vision.detections import merge, needs_second_pass
 
 SURE = 0.9
 
@@ -52,13 +52,13 @@ def shafts(*drawn: tuple[float, float, float]) -> ShaftDetections:
 def test_pictures_are_looked_at_again_where_something_is_left(
     found: ShaftDetections, leads: tuple, again: bool
 ) -> None:
-    assert unresolved(found, torch.tensor([leads]), SURE).tolist() == [again]
+    assert needs_second_pass(found, torch.tensor([leads]), SURE).tolist() == [again]
 
 
 def test_sure_shafts_stay_and_only_others_are_added() -> None:
     first = shafts((100, 0.95, 0), (300, 0.6, 0))
     second = shafts((106, 0.99, 2), (300, 0.8, 0), (100, 0.7, 60))
-    both = with_more(first, second, SURE)
+    both = merge(first, second, SURE)
     middle = both.axis_xy[0].mean(1)[:, 0]
     # The sure one as it was first seen; then the unsure one as it was seen last, and one that crosses.
     assert middle.round().tolist() == [100, 300, 100]
@@ -68,10 +68,10 @@ def test_sure_shafts_stay_and_only_others_are_added() -> None:
 
 
 def test_a_second_look_that_finds_nothing_takes_nothing_away() -> None:
-    both = with_more(shafts((100, 0.95, 0)), shafts(), SURE)
+    both = merge(shafts((100, 0.95, 0)), shafts(), SURE)
     assert both.valid.tolist() == [[True, False, False]]
     assert both.reason.tolist() == [FrameReason.OK]
-    nothing = with_more(shafts((100, 0.5, 0)), shafts(), SURE)
+    nothing = merge(shafts((100, 0.5, 0)), shafts(), SURE)
     assert not nothing.valid.any()
     assert nothing.reason.tolist() == [FrameReason.AMBIGUOUS]
 

@@ -6,7 +6,7 @@ import torch
 from drawn_bars import Bar, draw_bar, tissue
 
 from rmis_calib.vision import DetectorSettings, ShaftDetector
-from rmis_calib.vision.confidence import chance
+from rmis_calib.vision.fine.confidence import probability
 
 WHITE, BLACK = (255.0, 255.0, 255.0), (0.0, 0.0, 0.0)
 
@@ -64,9 +64,9 @@ def test_second_look_is_for_pictures_without_a_sure_shaft_only(monkeypatch: pyte
 
 def test_confidence_falls_as_contours_wander_and_shrink_and_the_inside_is_coloured() -> None:
     good = torch.tensor([[-5.0, 1.0, 0.9, -0.1, -1.0, 0.02]])
-    sure = float(chance(tuple(good.T[:, None]))[0, 0])
+    sure = float(probability(tuple(good.T[:, None]))[0, 0])
     assert sure > 0.9
     for mark, worse in enumerate((-3.0, 0.0, 0.3, -1.5, -3.0, 1.0)):
         bad = good.clone()
         bad[0, mark] = worse
-        assert float(chance(tuple(bad.T[:, None]))[0, 0]) < sure
+        assert float(probability(tuple(bad.T[:, None]))[0, 0]) < sure

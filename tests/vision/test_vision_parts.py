@@ -10,13 +10,13 @@ from pydantic import ValidationError
 
 from rmis_calib.geometry import Camera
 from rmis_calib.vision import DetectorSettings, FrameReason
-from rmis_calib.vision.canvas import plan_canvas, shrink
-from rmis_calib.vision.hough import EdgePixels, peaks, refine, vote
-from rmis_calib.vision.lens import Lens
-from rmis_calib.vision.linefit import fit_lines
-from rmis_calib.vision.runs import bridge, longest_run, run_lengths
-from rmis_calib.vision.shaft_mask import field_of_view, unlikeness, weighted_tint
-from rmis_calib.vision.wrists import between_wrists
+from rmis_calib.vision.coarse.appearance import field_of_view, shaft_contrast, weighted_tint
+from rmis_calib.vision.coarse.hough import EdgePixels, peaks, refine, vote
+from rmis_calib.vision.coarse.wrists import between_wrists
+from rmis_calib.vision.image.canvas import plan_canvas, shrink
+from rmis_calib.vision.image.line_fit import fit_lines
+from rmis_calib.vision.image.pixel_mapping import Lens
+from rmis_calib.vision.image.run_length import bridge, longest_run, run_lengths
 
 
 @pytest.mark.parametrize("field", [{"max_shafts": 0}, {"min_contrast": float("nan")}, {"edge_sample": 300}])
@@ -64,7 +64,7 @@ def test_the_field_of_view_ignores_a_black_shaft() -> None:
 def test_unlikeness_is_low_on_the_shaft() -> None:
     bar = draw_bar(0.0, size=(120, 160), width_px=30.0, end_px=400.0)
     rgb = bar.batch.float() / 255
-    views, _ = unlikeness(rgb, torch.ones(1, 120, 160, dtype=torch.bool))
+    views, _ = shaft_contrast(rgb, torch.ones(1, 120, 160, dtype=torch.bool))
     dark, lit = views[0]
     assert float(dark[60, 80]) < float(dark[20, 80]) - 1.0
     assert float(lit[60, 80]) < float(lit[20, 80]) - 0.5
@@ -75,7 +75,7 @@ def test_the_lit_view_sees_glare_as_shaft_and_a_cavity_as_not() -> None:
     rgb = bar.batch.float() / 255
     rgb[:, :, 57:63] = 0.6  # a stripe of glare along the bar
     rgb[:, :, 90:, :80] = 0.02  # a cavity below its left half
-    views, tone = unlikeness(rgb, torch.ones(1, 120, 160, dtype=torch.bool))
+    views, tone = shaft_contrast(rgb, torch.ones(1, 120, 160, dtype=torch.bool))
     (dark, lit), tone = views[0], tone[0]
     assert float(dark[60, 80]) > float(dark[50, 80]) + 0.3  # the dark view takes the stripe for tissue
     assert abs(float(lit[60, 80] - lit[50, 80])) < 0.1

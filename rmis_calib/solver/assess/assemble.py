@@ -1,0 +1,259 @@
+"""Estimates made into solutions: status, reasons, covariance, nuisances, observability and residuals."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from rmis_calib.geometry.rigid import rigid_from_rotation_translation
+from rmis_calib.geometry.rotations import matrix_to_rotvec
+from rmis_calib.solver.assess.observability import assess, detect_degeneracies
+from rmis_calib.solver.estimate.map_estimate import JointFit
+from rmis_calib.solver.estimate.multistart import cheirality
+from rmis_calib.solver.estimate.noise_levels import COMPONENTS, assumed_noise
+from rmis_calib.solver.estimate.outliers import REJECTED
+from rmis_calib.solver.model.measurement_rows import END, HEAD, LINE, MeasurementRows, pack
+from rmis_calib.solver.model.normal_equations import NoiseModel, motion_distance2
+from rmis_calib.solver.model.parameters import TRANSLATION_SIGMA_MM, UNITS, NuisancePriors, initial_state
+from rmis_calib.solver.model.residuals import State, residual_rows
+from rmis_calib.solver.observability import Degeneracy, ObservabilityTensors
+from rmis_calib.solver.problem import Problem
+from rmis_calib.solver.settings import SolverSettings
+from rmis_calib.solver.solution import AlternativeModel, Nuisance, Posterior, Solution
+from rmis_calib.solver.start.candidates import COLLAPSED_MM, collapsed
+from rmis_calib.solver.status import MotionReason, SolveStatus
+
+MIN_CHEIRALITY = 0.5
+CHECKED_MOTIONS = 256
+MAX_CHI2_PER_DOF = 3.0
+"""Past this the model is wrong (swapped cameras, another rig), and no larger noise level makes it right."""
+SHOWN_MOTIONS = 4096
+"""Motions from which the degenerate cases are recognised, and on which the scatter of the two-step methods is
+measured; longer recordings are sampled evenly."""
+
+
+def two_step_solution(
+    flat: Problem, R: Tensor, t: Tensor, covariance: Tensor, settings: SolverSettings, method: str
+) -> Solution:
+    """Solution of `paper` and `global`, which use the axis lines alone."""
+    axis_only = flat.only("axis")
+    covariance = covariance + _unseen_depth(flat, R, t)
+    packed = pack(axis_only, settings.noise)
+    noise, _ = assumed_noise(flat, settings.noise)
+    state = initial_state(NuisancePriors.of(axis_only), R, t)
+    front = cheirality(packed, state, torch.ones_like(packed.line_ok[0]))
+    status = torch.where(front < MIN_CHEIRALITY, SolveStatus.BEHIND_CAMERA, SolveStatus.CONVERGED)
+    status = torch.where(
+        torch.isfinite(covariance).all(-1).all(-1) & torch.isfinite(t).all(-1), status, SolveStatus.NON_FINITE
+    )
+    seen = packed.line_ok.any(0).any(0)
+    excess = _chi2_per_dof(packed, state, noise)
+    status = torch.where((excess > MAX_CHI2_PER_DOF) & (status == SolveStatus.CONVERGED), SolveStatus.MISFIT, status)
+    observability = _observability(axis_only, R, t, covariance, noise, (False, False, False), settings)
+    static = (observability.degeneracy & Degeneracy.STATIC_LAPAROSCOPE) > 0
+    # A two-step estimate from a laparoscope that stands still is biased by more than its scatter shows (DESIGN.md,
+    # section 3).
+    observability = replace(
+        observability, verdict=torch.where(static, observability.verdict.clamp_min(1), observability.verdict)
+    )
+    shown = _residuals(packed, state)
+    return Solution(
+        method=method,
+        camera_right_T_arm=rigid_from_rotation_translation(R, t),
+        camera_left_T_camera_right=flat.camera_T_camera_right[:, 1] if flat.n_cameras == 2 else None,
+        covariance=covariance,
+        status=status,
+        cheirality=front,
+        iterations=torch.zeros_like(status),
+        chi2_per_dof=excess,
+        distance=torch.full_like(seen, torch.nan, dtype=t.dtype),
+        reason=torch.where(seen, MotionReason.USED, MotionReason.NOT_MEASURED),
+        noise={},
+        nuisances={},
+        bias=torch.zeros_like(covariance[..., 0]),
+        observability=observability,
+        residual_lines=shown.lines,
+        residual_ends=shown.ends,
+        residual_heads=shown.heads,
+    )
+
+
+def _chi2_per_dof(packed: MeasurementRows, state: State, noise: NoiseModel) -> Float[Tensor, " b"]:
+    """Weighted squared residuals over degrees of freedom, on a few hundred motions: a fit in the wrong basin shows
+    here where the cheirality does not."""
+    part = packed.narrow(slice(None), slice(None, None, max(1, packed.motions // CHECKED_MOTIONS)))
+    return motion_distance2(part, state, noise).sum(-1) / (part.rows_ok.sum((0, 2)) - 6.0).clamp_min(1.0)
+
+
+def _unseen_depth(flat: Problem, R: Tensor, t: Tensor) -> Float[Tensor, "b 6 6"]:
+    """Variance along the ray of the RCM where the lines of one camera do not tell its distance; zero elsewhere."""
+    p = flat.arm_T_rcm[..., :3, 3] @ R.mT + t[:, None]
+    centred = p - p.mean(-2, keepdim=True)
+    nearly_static = centred.norm(dim=-1).mean(-1) < COLLAPSED_MM
+    unseen = collapsed(p) | (nearly_static if flat.n_cameras == 1 else torch.zeros_like(nearly_static))
+    ray = torch.nn.functional.normalize(p.mean(-2), dim=-1)
+    block = TRANSLATION_SIGMA_MM**2 * ray[:, :, None] * ray[:, None]
+    return torch.nn.functional.pad(torch.where(unseen[:, None, None], block, 0.0), (3, 0, 3, 0))
+
+
+def joint_solution(fit: JointFit, settings: SolverSettings, alternative: AlternativeModel | None = None) -> Solution:
+    """Solution of the joint estimate; its covariance allows for the alternative model."""
+    packed, state = fit.packed, fit.state
+    C = fit.covariance[:, :6, :6]
+    status, reason, excess = _judge(fit)
+    C = C * excess.clamp_min(1.0)[:, None, None]  # too small noise levels would make sigma too small (Birge 1932)
+    if alternative is not None:
+        C = _mixed(C, state.R, state.t, alternative)
+    distance = (fit.distance2 / packed.rows_ok.sum(0).clamp_min(1)).sqrt()
+    uses = (packed.has_contours, packed.has_ends, packed.has_heads)
+    left = rigid_from_rotation_translation(state.stereo_R, state.stereo_t) if packed.cameras == 2 else None
+    shown = _residuals(packed, state)
+    return Solution(
+        method="joint",
+        camera_right_T_arm=rigid_from_rotation_translation(state.R, state.t),
+        camera_left_T_camera_right=left,
+        covariance=C,
+        status=status,
+        cheirality=fit.cheirality,
+        iterations=fit.steps,
+        chi2_per_dof=excess,
+        distance=torch.where(packed.rows_ok.any(0), distance, torch.nan),
+        reason=reason,
+        noise={name: getattr(fit.noise, name).sqrt() for name in COMPONENTS},
+        nuisances=_nuisances(fit, settings),
+        bias=fit.bias[:, :6],
+        history=fit.history,
+        observability=_observability(fit.problem, state.R, state.t, C, fit.noise, uses, settings),
+        posterior=_posterior(fit, excess.clamp_min(1.0)),
+        residual_lines=shown.lines,
+        residual_ends=shown.ends,
+        residual_heads=shown.heads,
+    )
+
+
+def _mixed(
+    C: Float[Tensor, "b 6 6"], R: Float[Tensor, "b 3 3"], t: Float[Tensor, "b 3"], alternative: AlternativeModel
+) -> Float[Tensor, "b 6 6"]:
+    """Covariance about this estimate when the alternative model is right with its probability (Bayesian model
+    averaging: Hoeting et al. 1999)."""
+    T = alternative.camera_right_T_arm.reshape(-1, 4, 4)
+    gap = torch.cat((matrix_to_rotvec(T[:, :3, :3] @ R.mT), T[:, :3, 3] - t), dim=-1)
+    weight = alternative.probability.reshape(-1, 1, 1)
+    return (1.0 - weight) * C + weight * (alternative.covariance.reshape(-1, 6, 6) + gap[:, :, None] * gap[:, None])
+
+
+def _posterior(fit: JointFit, excess: Float[Tensor, " b"]) -> Posterior:
+    """The fit with all variances `excess` times as large."""
+    noise = NoiseModel(**{name: value * excess for name, value in vars(fit.noise).items()})
+    return Posterior(fit.state, fit.layout, noise, fit.information / excess[:, None, None])
+
+
+def _judge(fit: JointFit) -> tuple[Int[Tensor, " b"], Int[Tensor, "b n"], Float[Tensor, " b"]]:
+    """Status, what became of each motion, and chi^2 per degree of freedom."""
+    packed, used = fit.packed, fit.weight > REJECTED
+    cameras = torch.tensor(packed.row_camera, device=used.device)
+    measured = torch.stack([packed.rows_ok[cameras == c].any(0) for c in range(packed.cameras)])
+    good = (used & measured).any(0)
+    reason = torch.where(good, MotionReason.USED, MotionReason.OUTLIER)
+    reason = torch.where(good & (measured & ~used).any(0), MotionReason.OUTLIER_ONE_CAMERA, reason)
+    reason = torch.where(measured.any(0), reason, MotionReason.NOT_MEASURED)
+    # By camera: with swapped videos one camera alone fits perfectly, and the other one not at all.
+    kept = torch.where(measured.any(-1), (used & measured).sum(-1) / measured.sum(-1).clamp_min(1), 1.0).amin(0)
+    excess = fit.chi2 / (packed.keep(used).rows_ok.sum((0, 2)) - 6.0).clamp_min(1.0)
+    status = fit.status
+    for wrong, code in (
+        (fit.cheirality < MIN_CHEIRALITY, SolveStatus.BEHIND_CAMERA),
+        (kept < 0.5, SolveStatus.INCONSISTENT),
+        (excess > MAX_CHI2_PER_DOF, SolveStatus.MISFIT),
+    ):
+        status = torch.where(wrong & (status == SolveStatus.CONVERGED), code, status)
+    return status, reason, excess
+
+
+def _nuisances(fit: JointFit, settings: SolverSettings) -> dict[str, Nuisance]:
+    """Every estimated unknown beside the transform."""
+    deviation, _ = fit.layout.prior(fit.state)
+    sigma = fit.covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
+    out = {}
+    for name, part in fit.layout.blocks.items():
+        if name in ("rotation", "translation"):
+            continue
+        value = fit.state.radius[:, None] if name == "radius" else deviation[:, part]
+        held = sigma[:, part] > settings.unknowns.held_ratio * fit.layout.sigma[:, part]
+        out[name] = Nuisance(
+            value=value,
+            sigma=sigma[:, part],
+            unit=UNITS[name],
+            held=held,
+            pull=deviation[:, part] / fit.layout.sigma[:, part],
+            log_odds_nominal=_log_odds_nominal(
+                deviation[:, part], fit.covariance[:, part, part], fit.layout.sigma[:, part]
+            ),
+        )
+    return out
+
+
+def _log_odds_nominal(
+    deviation: Float[Tensor, "b k"], covariance: Float[Tensor, "b k k"], prior_sigma: Float[Tensor, "b k"]
+) -> Float[Tensor, " b"]:
+    """Log of the Bayes factor for "exactly nominal" against "anywhere within the prior".
+
+    It is the posterior's density at the nominal values over the prior's (Dickey & Lientz 1970). In units of the prior,
+    a direction of posterior variance p in which the estimate is at x adds -(log p + x^2 / p) / 2: one that the data do
+    not see adds nothing, one that they see and find nominal speaks for "nominal".
+    """
+    scaled = covariance / (prior_sigma[:, :, None] * prior_sigma[:, None])
+    values, vectors = torch.linalg.eigh(torch.nan_to_num(scaled))
+    along = (vectors.mT @ (deviation / prior_sigma)[..., None])[..., 0]
+    p = values.clamp(1e-12, 1.0)
+    return -0.5 * (p.log() + along.square() / p).sum(-1)
+
+
+def _observability(
+    problem: Problem,
+    R: Tensor,
+    t: Tensor,
+    C: Tensor,
+    noise: NoiseModel,
+    uses: tuple[bool, bool, bool],
+    settings: SolverSettings,
+) -> ObservabilityTensors:
+    if problem.n_motions > SHOWN_MOTIONS:
+        problem = problem.select_motions(slice(None, None, problem.n_motions // SHOWN_MOTIONS))
+    first = assess(problem, R, t, C, settings.verdict, torch.zeros_like(t[:, 0], dtype=torch.int64))
+    distance = torch.linalg.vector_norm(first.working_point_mm, dim=-1)
+    flags = detect_degeneracies(
+        problem, noise.kinematics_mm.sqrt(), noise.kinematics_rad.sqrt(), uses, settings.noise, distance
+    )
+    return replace(first, degeneracy=flags)
+
+
+@dataclass(frozen=True)
+class _Residuals:
+    """Root mean square residuals per camera and motion of each kind; NaN where not measured."""
+
+    lines: Float[Tensor, "b c n"]
+    ends: Float[Tensor, "b c n"]
+    heads: Float[Tensor, "b c n"]
+
+
+def _residuals(packed: MeasurementRows, state: State) -> _Residuals:
+    """Residuals of all motions, a long recording in parts."""
+    step = max(1, 8 * SHOWN_MOTIONS // packed.trials)
+    parts = [
+        _residuals_of(packed.narrow(slice(None), slice(n, n + step)), state) for n in range(0, packed.motions, step)
+    ]
+    return _Residuals(*(torch.cat([part[i] for part in parts], dim=-1) for i in range(3)))
+
+
+def _residuals_of(packed: MeasurementRows, state: State) -> list[Float[Tensor, "b c n"]]:
+    """Lines, ends and heads of motions that fit into memory at once; rows take turns between the cameras."""
+    squares, ok, c = residual_rows(packed, state).square_(), packed.rows_ok, packed.cameras
+    out, start = [], 0
+    for kind in (LINE, END, HEAD):
+        part = slice(start, start + packed.row_kind.count(kind))
+        total, count = (x[part].unflatten(0, (-1, c)).sum(0) for x in (squares, ok))
+        out.append(torch.where(count > 0, (total / count.clamp_min(1)).sqrt(), torch.nan).transpose(0, 1))
+        start = part.stop
+    return out

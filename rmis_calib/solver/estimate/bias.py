@@ -1,0 +1,150 @@
+"""Second-order bias of errors in variables, from antithetic simulations at the estimate.
+
+Noise of the kinematics enters the Jacobian, the weights and the residuals of the score g = J^T S^-1 r together, and
+noise of the pose that a camera sees enters through the curvature of the projection. So E[g] at the true parameters is
+not zero but of second order in the noise, the same in every motion, while the standard error falls with N: for many
+motions the estimate is biased by more than its sigma (DESIGN.md, section 3). The estimate that solves g = E[g] is free
+of it to that order.
+
+E[g] comes from simulating the measurement at the estimate, with the measured kinematics taken as true, and evaluating
+the score there: no simulated problem is solved. Each draw is used with both signs. Terms of first (and any odd) order
+in the noise cancel exactly in the mean of the pair, so what remains to average is the second-order term itself: one
+pair knows the bias to a few per cent of the standard error, where a plain bootstrap (DESIGN.md) with B replicas adds
+1/B of the variance and needs B solves. `tests/benchmarks/bench_solver_efficiency.py` compares.
+
+The same pairs correct the information: noise in J inflates J^T S^-1 J by its own variance, and 2 H - E[H] removes
+that to second order.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rmis_calib.solver.model.batched_linalg import cross, dot, unit
+from rmis_calib.solver.model.measurement_rows import LINE, MeasurementRows
+from rmis_calib.solver.model.normal_equations import NoiseModel, image_variance, normal_equations
+from rmis_calib.solver.model.parameters import ParameterLayout
+from rmis_calib.solver.model.residuals import Shaft, State, _line_geometry, predict_shaft
+
+SIMULATED_PART = 16
+"""One motion in so many is simulated in long recordings: the expected score is then known to about a fifth of its
+standard error at c = 1, much better below."""
+
+
+@dataclass(frozen=True)
+class ScoreBias:
+    """Expected score and information of simulated data, summed over the motions of the problem (priors not
+    included)."""
+
+    g: Float[Tensor, "b p"]
+    H: Float[Tensor, "b p p"]
+
+
+def _turned(v: Tensor, phi: Tensor) -> Tensor:
+    """exp([phi]x) v to second order."""
+    first = cross(phi, v)
+    return v + first + 0.5 * cross(phi, first)
+
+
+class _Draws:
+    """Standard normal draws of one simulation, and the same with the other sign: trials of twice as many."""
+
+    def __init__(self, packed: MeasurementRows, generator: torch.Generator) -> None:
+        c, b, n = packed.cameras, packed.trials, packed.motions
+
+        def draw(*shape: int) -> Tensor:
+            one = torch.randn(*shape, b, n, generator=generator, dtype=packed.p.dtype, device=packed.p.device)
+            return torch.cat((one, -one), dim=-2)
+
+        self.turn, self.shift = draw(3), draw(3)
+        self.camera_turn, self.camera_shift = draw(3, c), draw(3, c)
+        self.line = draw(*packed.line_rho.shape[:2])
+        self.end = draw(2, packed.end_xy.shape[1])
+        self.head = draw(2, packed.head_xy.shape[1])
+
+
+def simulate(packed: MeasurementRows, state: State, noise: NoiseModel, draws: "_Draws") -> MeasurementRows:
+    """The measurements that the state and the measured kinematics predict, with noise of the model and these draws
+    added."""
+
+    def scaled(variance: Tensor, draw: Tensor) -> Tensor:
+        return variance.sqrt()[:, None] * draw
+
+    shaft = predict_shaft(packed, state)
+    phi = scaled(noise.camera_rad, draws.camera_turn)
+    p = shaft.p + scaled(noise.camera_mm, draws.camera_shift)
+    d = unit(_turned(shaft.d, phi))
+    M = cross(p, d)
+    D = dot(M, M).sqrt()
+    seen = Shaft(p=p, d=d, m=M / D, u=cross(d, M / D), D=D, s0=dot(p, d), head=_turned(shaft.head, phi))
+    predicted = _line_geometry(packed, state, seen)
+    sigma = image_variance(packed, noise).sqrt()
+    lines = packed.row_kind.count(LINE)
+    off = sigma[:lines].view_as(predicted.f) * draws.line - predicted.f
+    line_xy = torch.addcmul(packed.line_xy, predicted.n_image, off)
+    turn = scaled(noise.kinematics_rad, draws.turn)
+    simulated = replace(
+        packed,
+        p=packed.p + scaled(noise.kinematics_mm, draws.shift),
+        v=unit(_turned(packed.v, turn)),
+        head=_turned(packed.head, turn),
+        line_xy=line_xy,
+    )
+    ends = packed.end_xy.shape[1]
+    if packed.has_ends:
+        q = seen.p + (packed.s_end + state.end_offset[:, None]) * seen.d
+        simulated = replace(simulated, end_xy=q[:2] / q[2] + sigma[lines : lines + ends] * draws.end)
+    if packed.has_heads:
+        q = seen.p + seen.head
+        simulated = replace(simulated, head_xy=q[:2] / q[2] + sigma[lines + ends :].view_as(draws.head) * draws.head)
+    return simulated
+
+
+def expected_score(
+    packed: MeasurementRows,
+    state: State,
+    layout: ParameterLayout,
+    noise: NoiseModel,
+    simulated_motions: int,
+    chunk: int,
+    seed: int,
+    weight: Float[Tensor, "c b n"] | None = None,
+) -> ScoreBias:
+    """E[g] and E[H] at the state, from at least `simulated_motions` antithetic pairs (or one motion in SIMULATED_PART
+    where that is more).
+
+    Args:
+        weight: of each camera's measurements of a motion (outliers near 0 do not take part).
+    """
+    generator = torch.Generator(device=packed.p.device).manual_seed(seed)
+    n, b = packed.motions, packed.trials
+    wanted = max(simulated_motions, n // SIMULATED_PART)
+    repeats = max(1, -(-wanted // n))
+    picked, picked_weight = packed, weight
+    if wanted < n:
+        order = torch.randperm(n, generator=generator, device=packed.p.device)[:wanted]
+        picked, picked_weight = packed.take_motions(order), None if weight is None else weight[..., order]
+    m = picked.motions
+    step_n, step_b = min(m, chunk), max(1, chunk // min(m, chunk))
+    g, H = (
+        torch.zeros_like(layout.sigma),
+        torch.zeros(b, layout.size, layout.size, dtype=packed.p.dtype, device=packed.p.device),
+    )
+    for b0 in range(0, b, step_b):
+        bs = slice(b0, min(b0 + step_b, b))
+        twice = torch.arange(bs.stop - bs.start, device=packed.p.device).repeat(2)
+        s, lay, nm = state.take(bs).take(twice), layout.take(bs).take(twice), noise.take(bs).take(twice)
+        for n0 in range(0, m, step_n):
+            ns = slice(n0, min(n0 + step_n, m))
+            part = picked.narrow(bs, ns)
+            both = part.take_trials(twice)
+            both_weight = None if picked_weight is None else picked_weight[:, bs, ns].index_select(1, twice)
+            for _ in range(repeats):
+                simulated = simulate(both, s, nm, _Draws(part, generator))
+                normal = normal_equations(simulated, s, lay, nm, both_weight)
+                g[bs] += normal.g.unflatten(0, (2, -1)).sum(0)
+                H[bs] += normal.H.unflatten(0, (2, -1)).sum(0)
+    scale = n / (m * repeats * 2.0)
+    return ScoreBias(g * scale, H * scale)

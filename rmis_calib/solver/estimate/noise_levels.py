@@ -1,0 +1,169 @@
+"""Noise levels from the data: variance components by restricted maximum likelihood, Fisher scoring.
+
+The covariance of one motion's residuals is linear in the components, S = sum_j v_j Q_j: image points on lines, ends,
+heads (Q diagonal), position and orientation of the kinematics (Q = W W^T and A A^T of residuals.py). With a = S^-1 r
+and the projection that the estimated parameters cost, the restricted likelihood has (Patterson & Thompson 1971; Searle,
+Casella & McCulloch 1992, ch. 8)
+
+    score_j = 1/2 [ sum a^T Q_j a - sum tr(S^-1 Q_j) + tr(H^-1 sum J^T S^-1 Q_j S^-1 J) ],
+    F_ij = 1/2 sum tr(S^-1 Q_i S^-1 Q_j).
+
+Steps are taken in log v_j, with a Gaussian prior about the assumed level: components that the data cannot separate
+(one camera, few motions) stay near it.
+"""
+
+import math
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rmis_calib.solver.model.measurement_rows import END, HEAD, LINE, MeasurementRows
+from rmis_calib.solver.model.normal_equations import NoiseModel, covariance, image_variance
+from rmis_calib.solver.model.parameters import ParameterLayout, columns
+from rmis_calib.solver.model.residuals import Rows, State, linearise
+from rmis_calib.solver.problem import Problem
+from rmis_calib.solver.settings import NoiseSettings
+
+COMPONENTS = ("line", "end", "head", "kinematics_mm", "kinematics_rad")
+MAX_LOG_STEP = 1.5
+SCORING_STEPS = 5
+SETTLED = 0.02
+"""Scoring ends when no level moves by more than this part."""
+
+
+def assumed_noise(problem: Problem, settings: NoiseSettings) -> tuple[NoiseModel, dict[str, Tensor]]:
+    """Noise levels given by the problem, else those of the settings; and per component (b,) whether it is to be
+    estimated."""
+    given = problem.noise
+    one = torch.ones_like(given.image)
+    free_image = (
+        torch.isnan(given.image) if settings.estimate == "auto" else one.bool() & (settings.estimate == "always")
+    )
+    free: dict[str, Tensor] = {name: free_image for name in ("line", "end", "head")}
+    levels = {}
+    for name, assumed in (
+        ("kinematics_mm", settings.kinematics_mm),
+        ("kinematics_rad", math.radians(settings.kinematics_deg)),
+    ):
+        value = getattr(given, name)
+        free[name] = (
+            torch.isnan(value)
+            if settings.estimate == "auto"
+            else free_image & True
+            if settings.estimate == "never"
+            else one.bool()
+        )
+        levels[name] = torch.nan_to_num(value, nan=assumed).square()
+    model = NoiseModel(
+        one, one, one, **levels, camera_mm=given.camera_mm.square(), camera_rad=given.camera_rad.square()
+    )
+    return model, free
+
+
+def estimate_components(
+    packed: MeasurementRows,
+    state: State,
+    layout: ParameterLayout,
+    noise: NoiseModel,
+    assumed: NoiseModel,
+    free: dict[str, Tensor],
+    settings: NoiseSettings,
+    weight: Float[Tensor, "c b n"] | None = None,
+) -> NoiseModel:
+    """Components after a few scoring steps at this state. Motions and cameras of weight below 1/2 do not take part.
+
+    Args:
+        packed: as many motions as fit at once; a thousand fix every component to a few per cent.
+    """
+    if not any(bool(value.any()) for value in free.values()):
+        return noise
+    if weight is not None:
+        packed = packed.keep(weight > 0.5)
+    rows, shaft = linearise(packed, state)
+    J = columns(layout, rows, shaft, packed, state).permute(2, 3, 0, 1)  # (b, n, k, p)
+    r = rows.r.permute(1, 2, 0)[..., None]
+    parts = _component_matrices(packed, rows)
+    centre = torch.stack([getattr(assumed, name) for name in COMPONENTS], dim=-1).clamp_min(1e-30).log()
+    free_mask = torch.stack([free[name] for name in COMPONENTS], dim=-1) & _present(packed)
+    prior = (2.0 * math.log(settings.prior_factor)) ** -2
+    for _ in range(SCORING_STEPS):
+        theta = torch.stack([getattr(noise, name) for name in COMPONENTS], dim=-1).clamp_min(1e-30).log()
+        score, fisher = _score(packed, rows, J, r, noise, parts, layout)
+        v = theta.exp()
+        score = v * score - prior * (theta - centre)
+        fisher = v[:, :, None] * v[:, None] * fisher + prior * torch.eye(
+            len(COMPONENTS), dtype=v.dtype, device=v.device
+        )
+        fixed = ~free_mask
+        fisher = torch.where(fixed[:, :, None] | fixed[:, None], torch.diag_embed(torch.ones_like(v)), fisher)
+        step = torch.linalg.solve(fisher, torch.where(fixed, 0.0, score)[..., None])[..., 0].clamp(
+            -MAX_LOG_STEP, MAX_LOG_STEP
+        )
+        moved = torch.where(fixed, v, (theta + step).exp())
+        noise = replace(noise, **{name: moved[:, i] for i, name in enumerate(COMPONENTS)})
+        if not bool((torch.where(fixed, 0.0, step).abs() > SETTLED).any()):
+            break
+    return noise
+
+
+def _present(packed: MeasurementRows) -> Tensor:
+    """Which components act on any measured row, (5,)."""
+    kinds = torch.tensor(packed.row_kind, device=packed.p.device)
+    seen = packed.rows_ok.flatten(1).any(1)
+    present = [bool((seen & (kinds == kind)).any()) for kind in (LINE, END, HEAD)]
+    return torch.tensor([*present, True, True], device=packed.p.device)
+
+
+def _component_matrices(packed: MeasurementRows, rows: Rows) -> tuple[list[Tensor], Tensor]:
+    """Diagonals of the image components (b, n, k) each, and the two kinematic matrices (2, b, n, k, k)."""
+    kinds = torch.tensor(packed.row_kind, device=rows.r.device)[:, None, None]
+    nominal = torch.where(packed.rows_ok, packed.rows_var, 0.0)
+    diagonals = [torch.where(kinds == kind, nominal, 0.0).permute(1, 2, 0) for kind in (LINE, END, HEAD)]
+    vectors = torch.stack((rows.w, rows.a)).permute(0, 3, 4, 2, 1)  # (2, b, n, k, 3)
+    return diagonals, vectors @ vectors.mT
+
+
+def _score(
+    packed: MeasurementRows,
+    rows: Rows,
+    J: Tensor,
+    r: Tensor,
+    noise: NoiseModel,
+    parts: tuple[list[Tensor], Tensor],
+    layout: ParameterLayout,
+) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b m m"]]:
+    """Score with respect to each variance, and the Fisher information."""
+    k, b, n = rows.r.shape
+    S = torch.empty((k, k, b, n), dtype=r.dtype, device=r.device)
+    covariance(rows.w, rows.a, image_variance(packed, noise), packed.cameras, noise, S)
+    inverse = _inverse(S.permute(2, 3, 0, 1))
+    a, B = inverse @ r, inverse @ J
+    H = (J.mT @ B).sum(1) + torch.diag_embed(layout.sigma.square().reciprocal())
+    H_inverse = _inverse(H)
+    diagonals, kinematic = parts
+    products, scores = [], []
+    for Q in (*diagonals, *kinematic):
+        diagonal = Q.ndim == 3
+        QS = inverse * Q[..., None, :] if diagonal else inverse @ Q  # S^-1 Q
+        Qa, QB = (Q[..., None] * a, Q[..., None] * B) if diagonal else (Q @ a, Q @ B)
+        cost = (H_inverse * (B.mT @ QB).sum(1).mT).sum((-2, -1))
+        scores.append(0.5 * ((a * Qa).sum((1, 2, 3)) - QS.diagonal(dim1=-2, dim2=-1).sum((1, 2)) + cost))
+        products.append(QS)
+    flat = torch.stack([p.flatten(1) for p in products], dim=1)
+    flat_t = torch.stack([p.mT.flatten(1) for p in products], dim=1)
+    return torch.stack(scores, dim=-1), 0.5 * flat @ flat_t.mT
+
+
+def _inverse(matrix: Float[Tensor, "*batch m m"]) -> Float[Tensor, "*batch m m"]:
+    """Inverse of positive definite matrices, scaled to a unit diagonal; zero for one that is singular to rounding.
+
+    Such a motion, or such an unknown, then takes no part in the score. It happens where an estimate runs away along a
+    direction that the data do not see.
+    """
+    scale = matrix.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
+    unit = matrix * scale[..., :, None] * scale[..., None, :]
+    inverse, failed = torch.linalg.inv_ex(unit)
+    usable = (failed == 0) & torch.isfinite(inverse).flatten(-2).all(-1)
+    return torch.where(usable[..., None, None], inverse * scale[..., :, None] * scale[..., None, :], 0.0)

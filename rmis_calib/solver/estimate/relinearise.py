@@ -1,0 +1,80 @@
+"""Joint offsets and the clock: unknowns that act through the kinematics, which the solver does not know.
+
+The caller hands in `kinematics(joint_offset, clock_s)`: the problem with both arms' poses evaluated at these offsets,
+their derivatives with it. The solver estimates increments from the derivatives, has the kinematics evaluated again
+there, and repeats until the increments vanish.
+
+**Clock start.** Offsets of seconds are far outside of any linearisation. They are found without knowing the
+transform: for every candidate offset the axis lines give a 9x9 Gram matrix and the least rotation cost over all of
+SO(3) (start/candidates.py). Only the right offset makes the pictures and the joints agree. All candidates are one
+batch. It is the cross-correlation of the two motions, with the unknown rotation between them eliminated.
+"""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rmis_calib.solver.estimate.map_estimate import JointFit, solve_joint
+from rmis_calib.solver.problem import Problem
+from rmis_calib.solver.settings import SolverSettings
+from rmis_calib.solver.start.candidates import find_candidates
+from rmis_calib.solver.start.line_statistics import LineStatistics
+
+Kinematics = Callable[[Float[Tensor, "b j"], Float[Tensor, " b"]], Problem]
+"""(joint offsets, clock offsets in s) -> problem with that trial axis, `joint_offset_at` and `clock_at` set."""
+
+ROUNDS = 5
+SETTLED_SIGMA = 0.05
+"""Rounds end when every increment is below this part of its own sigma."""
+SCAN_GRID = 240
+"""Rotations of the covering grid during the scan of clock offsets; the motion, not the basin, is looked for."""
+
+
+def scan_clock(
+    kinematics: Kinematics, joints: int, offsets_s: Float[Tensor, " k"]
+) -> tuple[float, Float[Tensor, " k"]]:
+    """The candidate clock offset at which lines and joints agree best, and the score of each (mean squared sine).
+
+    Candidates at which fewer than half as many motions are valid as at the best covered one do not compete.
+    """
+    problem = kinematics(offsets_s.new_zeros(offsets_s.shape[0], joints), offsets_s)
+    statistics = LineStatistics.from_problem(problem)
+    count = statistics.count.sum(-1)
+    score = find_candidates(statistics, SCAN_GRID, 2).score.amin(-1)
+    score = torch.where(count >= 0.5 * count.amax(), score, torch.inf)
+    return float(offsets_s[score.argmin()]), score
+
+
+def solve_relinearised(problem: Problem, settings: SolverSettings, kinematics: Kinematics) -> JointFit:
+    """Joint estimate with the kinematics evaluated anew at the estimated offsets, until they settle.
+
+    Args:
+        problem: one trial axis, at the offsets to start from (`joint_offset_at`, `clock_at`).
+        kinematics: of the same trials.
+    """
+    fit = solve_joint(problem, settings)
+    for _ in range(ROUNDS - 1):
+        if _settled(fit):
+            break
+        joint_at = _at(problem.joint_offset_at, fit.state.joint_offset)
+        clock_at = _at(problem.clock_at, fit.state.clock)
+        problem = kinematics(joint_at + fit.state.joint_offset, clock_at + fit.state.clock)
+        fit = solve_joint(problem, settings, fit)
+    return fit
+
+
+def _at(value: Tensor | None, like: Tensor) -> Tensor:
+    return torch.zeros_like(like) if value is None else value
+
+
+def _settled(fit: JointFit) -> bool:
+    sigma = fit.covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
+    for name in ("joint_offset", "clock"):
+        if name in fit.layout.blocks:
+            moved = getattr(fit.state, name)
+            moved = moved if moved.ndim == 2 else moved[:, None]
+            if bool((moved.abs() > SETTLED_SIGMA * sigma[:, fit.layout.blocks[name]]).any()):
+                return False
+    return True

@@ -1,0 +1,1 @@
+"""The measurement model: what a transform and the other unknowns predict, and how it differs from what was measured."""

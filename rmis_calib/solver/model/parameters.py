@@ -1,0 +1,246 @@
+"""Which parameters a joint estimate has, their priors, and their columns of the Jacobian."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rmis_calib.errors import InputError
+from rmis_calib.solver.model.batched_linalg import add_cross_, batch_last, dot, rotate
+from rmis_calib.solver.model.measurement_rows import LINE, MeasurementRows, line_points
+from rmis_calib.solver.model.residuals import Rows, Shaft, State, rcm_axes
+from rmis_calib.solver.problem import Problem
+from rmis_calib.solver.settings import NoiseSettings, UnknownSettings
+
+UNITS = {
+    "stereo_rotation": "rad",
+    "stereo_translation": "mm",
+    "radius": "mm",
+    "end_offset": "mm",
+    "rcm_offset": "mm",
+    "joint_offset": "rad or mm",
+    "clock": "s",
+    "edge_bias": "focal lengths",
+}
+"""Unit of each nuisance block."""
+
+
+TRANSLATION_SIGMA_MM = 2000.0
+"""Prior of the hand-eye translation about zero: no arm is longer. It moves a translation of 200 mm known to 1 mm by
+5e-5 mm, and keeps one that the data cannot see within the operating theatre."""
+
+
+@dataclass(frozen=True)
+class ParameterLayout:
+    """Blocks of the parameter vector, with the priors.
+
+    Attributes:
+        blocks: name -> slice; `rotation` and `translation` of the hand-eye transform come first.
+        sigma: prior 1 sigma of every parameter; infinite for the hand-eye rotation.
+        origin: state that the priors are centred on.
+    """
+
+    blocks: dict[str, slice]
+    sigma: Float[Tensor, "b p"]
+    origin: State
+
+    @property
+    def size(self) -> int:
+        return self.sigma.shape[-1]
+
+    def step(self, delta: Float[Tensor, "b p"]) -> dict[str, Tensor]:
+        """A parameter vector cut into blocks."""
+        return {name: delta[:, part] for name, part in self.blocks.items()}
+
+    def take(self, index: Tensor | slice) -> "ParameterLayout":
+        return ParameterLayout(self.blocks, self.sigma[index], self.origin.take(index))
+
+    def prior(self, state: State) -> tuple[Float[Tensor, "b p"], Float[Tensor, "b p"]]:
+        """Deviation of the state from the priors' centre, and their weights 1/sigma^2.
+
+        The stereo rotation's deviation is the vector of (R - R^T)/2, its sine: within 1e-5 of the angle up to half a
+        degree.
+        """
+        zero, origin = torch.zeros_like(state.t), self.origin
+        turned = origin.stereo_R.mT @ state.stereo_R
+        (_, yx, zx), (xy, _, zy), (xz, yz, _) = (column.unbind(-1) for column in turned.unbind(-1))
+        shifted = (origin.stereo_R.mT @ (state.stereo_t - origin.stereo_t)[..., None])[..., 0]
+        deviation = {
+            "rotation": zero,
+            "translation": state.t,
+            "stereo_rotation": 0.5 * torch.stack((zy - yz, xz - zx, yx - xy), dim=-1),
+            "stereo_translation": shifted,
+            "radius": (state.radius - origin.radius)[:, None],
+            "end_offset": (state.end_offset - origin.end_offset)[:, None],
+            "rcm_offset": state.rcm_offset - origin.rcm_offset,
+            "joint_offset": state.joint_offset - origin.joint_offset,
+            "clock": (state.clock - origin.clock)[:, None],
+            "edge_bias": (state.edge_bias - origin.edge_bias).flatten(1),
+        }
+        return torch.cat([deviation[name] for name in self.blocks], dim=-1), self.sigma.square().reciprocal()
+
+
+@dataclass(frozen=True)
+class NuisancePriors:
+    """What a problem gives once a trial: the nominal values of the unknowns beside the transform, and their priors
+    where the data name them.
+
+    Attributes:
+        stereo: `camera_T_camera_right` of the last camera.
+        radius: mm; 0 where unknown.
+        stereo_mm, stereo_rad: given noise of the stereo extrinsics; NaN where unknown.
+        joint_offset_sigma: prior of each joint offset (no joints: none can be estimated).
+        joint_offset_at, clock_at: where the kinematics were evaluated.
+        edge_bias: prior of the shift of each line row; 0 where there is none.
+    """
+
+    stereo: Float[Tensor, "b 4 4"]
+    radius: Float[Tensor, " b"]
+    stereo_mm: Float[Tensor, " b"]
+    stereo_rad: Float[Tensor, " b"]
+    joint_offset_sigma: Float[Tensor, "b j"]
+    joint_offset_at: Float[Tensor, "b j"]
+    clock_at: Float[Tensor, " b"]
+    edge_bias: Float[Tensor, "b l c"]
+
+    @classmethod
+    def of(cls, problem: Problem) -> "NuisancePriors":
+        """Of a problem with one trial axis."""
+        none = problem.radius_mm.new_zeros(problem.n_trials, 0)
+        sigma = none if problem.joint_offset_sigma is None else problem.joint_offset_sigma
+        return cls(
+            stereo=problem.camera_T_camera_right[:, -1],
+            radius=torch.nan_to_num(problem.radius_mm),
+            stereo_mm=problem.noise.stereo_mm,
+            stereo_rad=problem.noise.stereo_rad,
+            joint_offset_sigma=sigma,
+            joint_offset_at=torch.zeros_like(sigma) if problem.joint_offset_at is None else problem.joint_offset_at,
+            clock_at=torch.zeros_like(problem.radius_mm) if problem.clock_at is None else problem.clock_at,
+            edge_bias=problem.noise.edge_bias[:, None, None].expand(-1, line_points(problem), problem.n_cameras),
+        )
+
+    def repeat(self, part: slice, times: int) -> "NuisancePriors":
+        """Of some trials, each repeated."""
+        return NuisancePriors(**{name: value[part].repeat_interleave(times, 0) for name, value in vars(self).items()})
+
+
+def initial_state(nominal: NuisancePriors, R: Float[Tensor, "b 3 3"], t: Float[Tensor, "b 3"]) -> State:
+    """The hand-eye transform with every other unknown at its nominal value."""
+    zero = t[:, 0] * 0.0
+    return State(
+        R=R,
+        t=t,
+        stereo_R=nominal.stereo[:, :3, :3],
+        stereo_t=nominal.stereo[:, :3, 3],
+        radius=nominal.radius,
+        end_offset=zero,
+        rcm_offset=zero[:, None].expand(-1, 2),
+        joint_offset=torch.zeros_like(nominal.joint_offset_at),
+        clock=zero,
+        edge_bias=torch.zeros_like(nominal.edge_bias),
+    )
+
+
+def make_layout(
+    nominal: NuisancePriors, packed: MeasurementRows, origin: State, settings: UnknownSettings, noise: NoiseSettings
+) -> ParameterLayout:
+    """The parameters that the settings ask for and the measurements can carry.
+
+    Offsets of a state count from where the kinematics were evaluated, their priors from zero.
+    """
+    b, like = origin.t.shape[0], origin.t
+    stereo_rad = torch.nan_to_num(nominal.stereo_rad, nan=noise.stereo_deg * torch.pi / 180.0)
+    stereo_mm = torch.nan_to_num(nominal.stereo_mm, nan=noise.stereo_mm)
+    infinite = torch.full_like(like[:, 0], torch.inf)
+    far = torch.full_like(infinite, TRANSLATION_SIGMA_MM)
+    entries: list[tuple[str, int, Tensor]] = [("rotation", 3, infinite), ("translation", 3, far)]
+    if settings.stereo and packed.cameras == 2:
+        entries += [("stereo_rotation", 3, stereo_rad), ("stereo_translation", 3, stereo_mm)]
+    if settings.radius and packed.has_contours:
+        entries.append(("radius", 1, settings.radius_sigma_relative * origin.radius))
+    if settings.end_offset and packed.has_ends:
+        entries.append(("end_offset", 1, torch.full_like(infinite, settings.end_offset_sigma_mm)))
+    if settings.rcm_offset:
+        entries.append(("rcm_offset", 2, torch.full_like(infinite, settings.rcm_offset_sigma_mm)))
+    if settings.joint_offsets != "never" and packed.joint is not None and nominal.joint_offset_sigma.shape[1] > 0:
+        entries.append(("joint_offset", packed.joint.shape[1], nominal.joint_offset_sigma))
+    if settings.clock and packed.clock is not None:
+        entries.append(("clock", 1, torch.full_like(infinite, settings.clock_sigma_s)))
+    if settings.edge_bias:
+        entries.append(("edge_bias", origin.edge_bias[0].numel(), nominal.edge_bias.flatten(1)))
+    entries = [entry for entry in entries if bool((entry[2] > 0).any())]
+    blocks, sigmas, start = {}, [], 0
+    for name, width, sigma in entries:
+        blocks[name] = slice(start, start + width)
+        sigmas.append(sigma if sigma.ndim == 2 else sigma[:, None].expand(b, width))
+        start += width
+    centre = replace(origin, joint_offset=-nominal.joint_offset_at, clock=-nominal.clock_at)
+    return ParameterLayout(blocks, torch.cat(sigmas, dim=-1).clamp_min(1e-12), centre)
+
+
+def columns(
+    layout: ParameterLayout,
+    rows: Rows,
+    shaft: Shaft,
+    packed: MeasurementRows,
+    state: State,
+    out: Float[Tensor, "k p b n"] | None = None,
+) -> Float[Tensor, "k p b n"]:
+    """Jacobian of the residuals, in the order of the layout's blocks (residuals.py derives it).
+
+    Args:
+        out: where to write it.
+    """
+    if out is None:
+        out = rows.r.new_empty((rows.r.shape[0], layout.size, *rows.r.shape[1:]))
+    by_parameter = out.transpose(0, 1)  # (p, k, b, n)
+    right_p = shaft.p[:, 0]
+
+    def turned(target: Tensor, lever: Tensor, w: Tensor, a: Tensor) -> None:
+        add_cross_(target.copy_(a), lever, w)
+
+    turned(by_parameter[layout.blocks["rotation"]], right_p - state.t.T[..., None], rows.w, rows.a)
+    by_parameter[layout.blocks["translation"]] = rows.w
+    for name in ("stereo_rotation", "stereo_translation"):
+        if name in layout.blocks:  # rows alternate between the cameras: the left one's are every second
+            target = by_parameter[layout.blocks[name]].zero_()[:, 1::2]
+            if name == "stereo_rotation":
+                turned(target, right_p, rows.w[:, 1::2], rows.a[:, 1::2])
+            else:
+                target.copy_(rows.w[:, 1::2])
+    if "radius" in layout.blocks:
+        by_parameter[layout.blocks["radius"]] = rows.radius
+    if "end_offset" in layout.blocks:
+        by_parameter[layout.blocks["end_offset"]] = rows.end
+    for name in ("rcm_offset", "joint_offset", "clock"):
+        if name in layout.blocks:
+            by_parameter[layout.blocks[name]] = _displaced(name, rows, packed, state)
+    if "edge_bias" in layout.blocks:
+        out[:, layout.blocks["edge_bias"]] = _shifts(packed, rows.r)
+    return out
+
+
+def _displaced(name: str, rows: Rows, packed: MeasurementRows, state: State) -> Float[Tensor, "q k b n"]:
+    """Columns of the unknowns that move the shaft in `arm`."""
+    R = batch_last(state.R, 2)[..., None]
+    if name == "rcm_offset":
+        return torch.stack([dot(rows.w, rotate(R, e)[:, None]) for e in rcm_axes(packed)])
+    if packed.joint is not None and name == "joint_offset":
+        return torch.stack([_effect(rows, R, motion) for motion in packed.joint.unbind(1)])
+    if packed.clock is not None and name == "clock":
+        return _effect(rows, R, packed.clock)[None]
+    raise InputError(where=name, expected="derivatives of the kinematics", found="none")
+
+
+def _shifts(packed: MeasurementRows, like: Float[Tensor, "k b n"]) -> Float[Tensor, "k s b n"]:
+    """A unit shift of each line row where it was measured; line rows come first."""
+    count = packed.row_kind.count(LINE)
+    unit = torch.eye(like.shape[0], count, dtype=like.dtype, device=like.device)
+    return unit[:, :, None, None] * packed.rows_ok[:, None]
+
+
+def _effect(rows: Rows, R: Tensor, displacement: Float[Tensor, "6 b n"]) -> Float[Tensor, "k b n"]:
+    """Effect of a displacement (rotation, translation; in `arm`) of the shaft on every row."""
+    turn, shift = rotate(R, displacement[:3]), rotate(R, displacement[3:])
+    return dot(rows.a, turn[:, None]) + dot(rows.w, shift[:, None])

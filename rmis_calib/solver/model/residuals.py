@@ -1,0 +1,334 @@
+"""Residuals of lines, contours, ends and head points, with their analytic Jacobians.
+
+**Geometry** (DESIGN.md, section 4). In a camera's frame let p be the RCM, d the shaft's direction (RCM to tip), M = p x
+d, D = |M| the distance of the axis from the optical centre, m = M/D, u = d x m the unit vector from the optical centre
+to the axis' nearest point c = D u, and s0 = p.d, so that p = D u + s0 d. A plane through the optical centre that
+touches a cylinder of radius r about the axis has the unit normal n with n.d = 0 and n.p = rho r, rho = +1 or -1 for the
+two contours: n = cos(alpha) m + rho sin(alpha) u, sin(alpha) = r/D. The axis itself is rho = 0, n = m.
+
+**Line row.** For a measured image point, X = (x, y, 1), f = n.X / |n_xy| is its signed distance from the predicted
+line, and one unit of noise across the line is one unit of f. Move the shaft rigidly, so that a point of it at
+coordinate s from the RCM moves by delta(s) = dp + s dd, and let r grow by dr. Differentiating n.d = 0 and n.p = rho r
+gives dn = -(n.dd) d + e t with t = cos(alpha) u - rho sin(alpha) m, t.p = D cos(alpha), and e = (rho dr - n.dp + s0
+n.dd) / (D cos(alpha)). With T = t.X the ray X touches the cylinder at s_X = X_d D cos(alpha) / T - s0 from the RCM, and
+all terms collect into
+
+    df = kappa (rho dr - n . delta(s_X)),      kappa = T / (D cos(alpha) |n_xy|):
+
+the contour moves by what the touched point moves along the normal, seen at its depth. (|n_xy| multiplies f and is held:
+its derivative is of second order at a small residual.)
+
+**End row.** chi = X_d / X_u is the tangent of the angle in the axis plane between u and the measured end's ray, which
+meets the axis at D chi - s0 from the RCM. The residual is chi - (s0 + s_e)/D, divided by |d chi / d g| for a step g
+along the imaged axis, so that noise along the axis has unit effect. Moving the shaft by delta moves the ray's meeting
+point by chi (u.delta) - d.delta along it:
+
+    de = -(d - chi u) . delta(s_e) / (D |d chi / d g|),      and d e / d s_e = -1 / (D |d chi / d g|).
+
+**Head row.** y - pi(q), q the head point, pi the pinhole: de = -J_pi(q) dq.
+
+**One form for all rows.** A rigid motion of the shaft (rotation phi about the RCM, translation tau) moves a point at
+the vector h from the RCM by tau + phi x h. So each row is w.(tau + phi x h) = w.tau + a.phi with a = h x w, h = s d for
+lines and ends. From (w, a) follow
+ - a change of the hand-eye transform, R <- exp(dphi) R, t <- t + dt: phi = dphi, tau = dphi x (p - t) + dt, so the
+   columns are (p - t) x w + a and w; the stereo extrinsics, perturbed on the right like their noise, have p x w + a and
+   w in the rows of the left camera;
+ - noise of `arm_T_rcm`: isotropic, so its covariance of rows i, j is sigma_mm^2 w_i.w_j + sigma_rad^2 a_i.a_j in any
+   frame;
+ - joint offsets, clock and RCM offset: w.tau + a.phi of the displacement that they cause.
+So every nuisance and every noise source costs scalar products only. `tests/solver/model/test_residuals.py` holds all
+of this against `torch.func.jacrev`.
+"""
+
+from dataclasses import dataclass, fields, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rmis_calib.geometry.rotations import rotvec_to_matrix
+from rmis_calib.solver.model.batched_linalg import cross, dot, rotate_trials, unit
+from rmis_calib.solver.model.measurement_rows import MeasurementRows
+
+MAX_SINE = 0.99
+"""Clamp of r/D. A shaft nearer than that would touch the lens; only trial steps get there."""
+MIN_COSINE = 1e-6
+"""Smallest T and X_u divided by: a ray along the axis meets it nowhere."""
+
+
+@dataclass(frozen=True)
+class State:
+    """Estimates of `b` trials. The offsets are zero where they are not estimated.
+
+    Attributes:
+        R: `camera_right_R_arm`.
+        t: `camera_right_t_arm`, mm.
+        stereo_R: `camera_left_R_camera_right`.
+        stereo_t: its translation, mm.
+        radius: of the shaft, mm.
+        end_offset: of the shaft's end along the axis, mm.
+        rcm_offset: of the shaft's axis from the nominal RCM, along two directions across the axis, mm.
+        joint_offset: in each joint's unit.
+        clock: seconds added to the time at which the joints were read.
+        edge_bias: shift across its line that a line row of each camera has in every motion alike, normalised units.
+    """
+
+    R: Float[Tensor, "b 3 3"]
+    t: Float[Tensor, "b 3"]
+    stereo_R: Float[Tensor, "b 3 3"]
+    stereo_t: Float[Tensor, "b 3"]
+    radius: Float[Tensor, " b"]
+    end_offset: Float[Tensor, " b"]
+    rcm_offset: Float[Tensor, "b 2"]
+    joint_offset: Float[Tensor, "b j"]
+    clock: Float[Tensor, " b"]
+    edge_bias: Float[Tensor, "b l c"]
+
+    def where(self, chosen: Tensor, other: "State") -> "State":
+        """This state in the chosen trials, `other` elsewhere."""
+
+        def pick(a: Tensor, b: Tensor) -> Tensor:
+            return torch.where(chosen.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
+
+        return State(**{f.name: pick(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)})
+
+    def take(self, index: Tensor | slice) -> "State":
+        """The state of the trials `index`."""
+        return State(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+    def moved(self, step: dict[str, Tensor]) -> "State":
+        """The state after a step, given by parameter block (`parameters.ParameterLayout.blocks`)."""
+        changed = {}
+        turns = [name for name in ("rotation", "stereo_rotation") if name in step]
+        angles = [step[name] for name in turns]
+        turned = dict(zip(turns, rotvec_to_matrix(torch.stack(angles)), strict=True)) if turns else {}
+        if "rotation" in step:
+            changed["R"] = turned["rotation"] @ self.R
+        if "stereo_rotation" in step:
+            changed["stereo_R"] = self.stereo_R @ turned["stereo_rotation"]
+        if "stereo_translation" in step:
+            changed["stereo_t"] = self.stereo_t + (self.stereo_R @ step["stereo_translation"][..., None])[..., 0]
+        for block, name in (("translation", "t"), ("rcm_offset", "rcm_offset"), ("joint_offset", "joint_offset")):
+            if block in step:
+                changed[name] = getattr(self, name) + step[block]
+        for name in ("radius", "end_offset", "clock"):
+            if name in step:
+                changed[name] = getattr(self, name) + step[name][:, 0]
+        if "edge_bias" in step:
+            changed["edge_bias"] = self.edge_bias + step["edge_bias"].reshape(self.edge_bias.shape)
+        return replace(self, **changed)
+
+
+@dataclass(frozen=True)
+class Shaft:
+    """Predicted shaft in every camera's frame, component first: p, d, m, u (3, c, b, n), D and s0 (c, b, n)."""
+
+    p: Float[Tensor, "3 c b n"]
+    d: Float[Tensor, "3 c b n"]
+    m: Float[Tensor, "3 c b n"]
+    u: Float[Tensor, "3 c b n"]
+    D: Float[Tensor, "c b n"]
+    s0: Float[Tensor, "c b n"]
+    head: Float[Tensor, "3 c b n"]
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Residuals and first-order effects of a rigid motion of the shaft, in `camera_right`; rows of absent
+    measurements are zero.
+
+    Attributes:
+        r: residuals, normalised image units.
+        w: effect of a translation of the shaft.
+        a: effect of a rotation of the shaft about the RCM.
+        radius: effect of the radius.
+        end: effect of the end offset.
+    """
+
+    r: Float[Tensor, "k b n"]
+    w: Float[Tensor, "3 k b n"]
+    a: Float[Tensor, "3 k b n"]
+    radius: Float[Tensor, "k b n"]
+    end: Float[Tensor, "k b n"]
+
+
+def camera_poses(packed: MeasurementRows, state: State) -> tuple[Float[Tensor, "b c 3 3"], Float[Tensor, "b c 3"]]:
+    """`camera_T_camera_right` of the state."""
+    R, t = packed.camera_R.permute(3, 2, 0, 1), packed.camera_t.permute(2, 1, 0)
+    if packed.cameras == 2:
+        R, t = torch.stack((R[:, 0], state.stereo_R), dim=1), torch.stack((t[:, 0], state.stereo_t), dim=1)
+    return R, t
+
+
+def rcm_axes(packed: MeasurementRows) -> tuple[Float[Tensor, "3 b n"], Float[Tensor, "3 b n"]]:
+    """Two unit directions across the shaft, fixed to `rcm`, in `arm`: the axis of `rcm` that follows the one nearest to
+    the shaft (x, y, z, x) made perpendicular to it, and the shaft times that.
+
+    The offset is one constant only while the choice stays the same: while the shaft keeps within 45 degrees of one
+    axis. (To compare the two axes that lie across the shaft instead changes the choice from motion to motion.)
+    """
+    along = torch.stack([dot(packed.R[:, i], packed.v).abs() for i in range(3)])
+    nearest = along.argmax(0)
+    axis = torch.where(nearest == 2, packed.R[:, 0], torch.where(nearest == 0, packed.R[:, 1], packed.R[:, 2]))
+    e1 = unit(axis - dot(axis, packed.v) * packed.v)
+    return e1, cross(packed.v, e1)
+
+
+def predict_shaft(packed: MeasurementRows, state: State) -> Shaft:
+    """The shaft in the frame of each camera."""
+    arm_p, arm_v, arm_head = _corrected(packed, state)
+    camera_R, camera_t = camera_poses(packed, state)
+    R = camera_R @ state.R[:, None]
+    t = (camera_R @ state.t[:, None, :, None])[..., 0] + camera_t
+    p = rotate_trials(R, arm_p) + t.permute(2, 1, 0)[..., None]
+    d = rotate_trials(R, arm_v)
+    M = cross(p, d)
+    D = dot(M, M).sqrt().clamp_min(1e-9)
+    s0 = dot(p, d)
+    head = rotate_trials(R, arm_head) if packed.has_heads else d
+    return Shaft(p=p, d=d, m=M / D, u=torch.addcmul(p, s0, d, value=-1.0) / D, D=D, s0=s0, head=head)
+
+
+def _corrected(packed: MeasurementRows, state: State) -> tuple[Tensor, Tensor, Tensor]:
+    """RCM, direction and head vector in `arm` with the estimated offsets applied, to first order in the rotation."""
+    p, v, head = packed.p, packed.v, packed.head
+    if bool((state.rcm_offset != 0).any()):
+        e1, e2 = rcm_axes(packed)
+        p = p + state.rcm_offset[:, 0, None] * e1 + state.rcm_offset[:, 1, None] * e2
+    displacement = None
+    if packed.joint is not None and bool((state.joint_offset != 0).any()):
+        displacement = (packed.joint * state.joint_offset.T[:, :, None]).sum(1)
+    if packed.clock is not None and bool((state.clock != 0).any()):
+        moved = packed.clock * state.clock[:, None]
+        displacement = moved if displacement is None else displacement + moved
+    if displacement is not None:
+        p = p + displacement[3:]
+        v = unit(v + cross(displacement[:3], v))
+        head = head + cross(displacement[:3], head)
+    return p, v, head
+
+
+def residual_rows(packed: MeasurementRows, state: State) -> Float[Tensor, "k b n"]:
+    """Residuals alone."""
+    shaft = predict_shaft(packed, state)
+    parts = [_line_geometry(packed, state, shaft).f.flatten(0, 1)]
+    if packed.has_ends:
+        parts.append(_end_geometry(packed, state, shaft)[0])
+    if packed.has_heads:
+        parts.append(_head_geometry(packed, shaft)[0].flatten(0, 1))
+    return torch.where(packed.rows_ok, torch.cat(parts), 0.0)
+
+
+def linearise(packed: MeasurementRows, state: State) -> tuple[Rows, Shaft]:
+    """Residuals with their effects of a rigid motion of the shaft.
+
+    n, m and u all lie across d, so d x n = cos(alpha) u - rho sin(alpha) m and d x u = -m: w and a of lines and ends
+    are combinations of the axes m, u and d, which alone are turned into `camera_right`.
+    """
+    shaft = predict_shaft(packed, state)
+    camera_R, _ = camera_poses(packed, state)
+    m, u, d = _into_right(camera_R, torch.stack((shaft.m, shaft.u, shaft.d), dim=1)).unsqueeze(2).unbind(1)
+    lines, c = packed.line_xy.shape[1], packed.cameras
+    ends = c * packed.has_ends
+    shape = (lines * c + ends + 2 * c * packed.has_heads, *shaft.D.shape[1:])
+    r, radius, end = (shaft.D.new_zeros(shape) for _ in range(3))
+    w, a = (shaft.D.new_empty((3, *shape)) for _ in range(2))
+    seen, ok = _line_geometry(packed, state, shaft), packed.line_ok
+    part = slice(0, lines * c)
+    kappa, kappa_s = torch.where(ok, seen.kappa, 0.0), torch.where(ok, seen.kappa_s, 0.0)
+    r[part] = torch.where(ok, seen.f, 0.0).flatten(0, 1)
+    radius[part] = (kappa * packed.line_rho).flatten(0, 1)
+    for out, along_m, along_u in (
+        (w, -kappa * seen.cosine, -kappa * seen.sine),
+        (a, kappa_s * seen.sine, -kappa_s * seen.cosine),
+    ):
+        out = out[:, part].unflatten(1, (lines, c))
+        torch.mul(along_m, m, out=out).addcmul_(along_u, u)
+    if packed.has_ends:
+        part = slice(lines * c, lines * c + ends)
+        e, chi, s_end, gain = _end_geometry(packed, state, shaft)
+        gain = torch.where(packed.end_ok, gain, 0.0)
+        r[part], end[part] = torch.where(packed.end_ok, e, 0.0), -gain
+        torch.mul(-gain, d[:, 0], out=w[:, part]).addcmul_(gain * chi, u[:, 0])
+        torch.mul(-gain * chi * s_end, m[:, 0], out=a[:, part])
+    if packed.has_heads:
+        part = slice(lines * c + ends, None)
+        e, w_head = _head_geometry(packed, shaft)
+        both = torch.cat((w_head, cross(shaft.head[:, None].expand_as(w_head), w_head)), dim=1)
+        both = torch.where(packed.head_ok, _into_right(camera_R, both), 0.0)
+        r[part] = torch.where(packed.head_ok, e, 0.0).flatten(0, 1)
+        w[:, part], a[:, part] = both[:, :2].flatten(1, 2), both[:, 2:].flatten(1, 2)
+    return Rows(r=r, w=w, a=a, radius=radius, end=end), shaft
+
+
+def _into_right(camera_R: Float[Tensor, "b c 3 3"], v: Float[Tensor, "3 m c b n"]) -> Float[Tensor, "3 m c b n"]:
+    """Vectors of each camera's frame turned into `camera_right`."""
+    back = camera_R.permute(1, 0, 3, 2).expand(v.shape[1], -1, -1, -1, -1).flatten(0, 2)
+    return torch.matmul(back, v.flatten(1, 3).transpose(0, 1)).transpose(0, 1).unflatten(1, v.shape[1:4])
+
+
+@dataclass(frozen=True)
+class LineGeometry:
+    """Residuals f of the line rows and what their derivatives consist of; all but `n_image` are (l, c, b, n).
+
+    Attributes:
+        f: signed distance of the measured point from the predicted line.
+        sine, cosine: rho sin(alpha) and cos(alpha).
+        kappa: effect of the touched point's motion along the normal; kappa_s: times its coordinate from the RCM.
+        n_image: the predicted line's direction across itself, unit, in the image (2, l, c, b, n).
+    """
+
+    f: Float[Tensor, "l c b n"]
+    sine: Float[Tensor, "l c b n"]
+    cosine: Float[Tensor, "l c b n"]
+    kappa: Float[Tensor, "l c b n"]
+    kappa_s: Float[Tensor, "l c b n"]
+    n_image: Float[Tensor, "2 l c b n"]
+
+
+def _line_geometry(packed: MeasurementRows, state: State, shaft: Shaft) -> LineGeometry:
+    x, y = packed.line_xy.unbind()
+    sine = (packed.line_rho * (state.radius[:, None] / shaft.D)).clamp(-MAX_SINE, MAX_SINE)
+    cosine = (1.0 - sine.square()).sqrt()
+    n_image = torch.addcmul(cosine * shaft.m[:2, None], sine, shaft.u[:2, None])
+    n_xy = n_image.square().sum(0).sqrt().clamp_min(1e-12)
+    X_m, X_u, X_d = (_along(axis, x, y) for axis in (shaft.m, shaft.u, shaft.d))
+    f = torch.addcmul(cosine * X_m, sine, X_u) / n_xy
+    if bool((state.edge_bias != 0).any()):
+        f = f + state.edge_bias.permute(1, 2, 0)[..., None]
+    kappa = torch.addcmul(cosine * X_u, sine, X_m, value=-1.0) / (shaft.D * cosine * n_xy)
+    return LineGeometry(f, sine, cosine, kappa, X_d / n_xy - kappa * shaft.s0, n_image / n_xy)
+
+
+def _along(axis: Float[Tensor, "3 c b n"], x: Float[Tensor, "*l c b n"], y: Float[Tensor, "*l c b n"]) -> Tensor:
+    """Component of the rays (x, y, 1) along an axis."""
+    first, second, third = axis.unbind()
+    return torch.addcmul(torch.addcmul(third, first, x), second, y)
+
+
+def _end_geometry(packed: MeasurementRows, state: State, shaft: Shaft) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """e, chi, s_e and d e / d s_e without its sign, all (c, b, n)."""
+    x, y = packed.end_xy.unbind()
+    u, d, m = shaft.u, shaft.d, shaft.m
+    X_u, X_d = _along(u, x, y), _along(d, x, y)
+    X_u = torch.where(X_u.abs() < MIN_COSINE, MIN_COSINE, X_u)
+    chi = X_d / X_u
+    image_m = m[:2]
+    m_xy = image_m.square().sum(0).sqrt().clamp_min(1e-12)
+    step = d[:2] - chi * u[:2]
+    across = torch.addcmul(step[1] * image_m[0], step[0], image_m[1], value=-1.0)
+    slope = (across / m_xy).abs().clamp_min(1e-12) / X_u.abs()
+    s_end = (packed.s_end + state.end_offset[:, None]).expand_as(chi)
+    return (chi - (shaft.s0 + s_end) / shaft.D) / slope, chi, s_end, (shaft.D * slope).reciprocal()
+
+
+def _head_geometry(packed: MeasurementRows, shaft: Shaft) -> tuple[Tensor, Tensor]:
+    """e (2, c, b, n) and w (3, 2, c, b, n)."""
+    q = shaft.p + shaft.head
+    depth = torch.where(q[2].abs() < MIN_COSINE, MIN_COSINE, q[2])
+    x, y, zero = q[0] / depth, q[1] / depth, torch.zeros_like(depth)
+    e = torch.stack((packed.head_xy[0] - x, packed.head_xy[1] - y))
+    w = torch.stack(
+        (torch.stack((-1.0 / depth, zero)), torch.stack((zero, -1.0 / depth)), torch.stack((x / depth, y / depth)))
+    )
+    return e, w

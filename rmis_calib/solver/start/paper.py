@@ -1,0 +1,165 @@
+"""The published method, step by step, and the empirical covariance of it and of `global`.
+
+Paper, Algorithm 1: each camera gives an estimate of its own of the same unknown (the left one through n_lr = R_Z^T n_l,
+Eq. 8), and the two are averaged. Everything works on sums over motions (line_statistics.py).
+"""
+
+from functools import lru_cache
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rmis_calib.geometry.rotations import chordal_mean, matrix_to_quat, project_to_so3, quat_to_matrix
+from rmis_calib.solver.problem import Problem
+from rmis_calib.solver.start.candidates import solve_translation
+from rmis_calib.solver.start.line_statistics import LineStatistics, plane_normals
+from rmis_calib.solver.start.rotation_search import unvec
+
+QUATERNION_STEPS = 60
+MAX_QUATERNION_STEP = 0.05
+"""Steps stay below 6 degrees, as those of a line search do: the published refinement is a local one. Unbounded
+Gauss-Newton steps leap from the wrong basin, into which the linear start falls at c = 0.5 already (164 degrees off), to
+the right one in about nine of ten trials; that is luck, and `global` does it by search."""
+QUATERNION_TOLERANCE = 1e-7
+MAX_QUATERNION_DAMPING = 1e3
+
+
+def linear_rotation(gram: Float[Tensor, "b 9 9"]) -> Float[Tensor, "b 3 3"]:
+    """Eqs. 10 to 13: smallest right singular vector, scaled by sign(det)/|det|^(1/3), then projected to SO(3).
+
+    The smallest eigenvector of the Gram matrix is the smallest right singular vector of the stacked rows. The published
+    scaling makes the determinant 1 but leaves the matrix short of orthogonal, hence the projection.
+    """
+    _, vectors = torch.linalg.eigh(gram)
+    V = unvec(vectors[..., 0])
+    det = torch.linalg.det(V)
+    scaled = (
+        torch.where(det < 0, -1.0, 1.0)[..., None, None]
+        * V
+        / det.abs().clamp_min(1e-300).pow(1.0 / 3.0)[..., None, None]
+    )
+    return project_to_so3(scaled)
+
+
+def refine_quaternion(gram: Float[Tensor, "b 9 9"], R: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 3"]:
+    """Eqs. 14 to 17: minimise sum (n.R(q) v)^2 over the unit quaternion.
+
+    The gradient is analytic and the curvature Gauss and Newton's, both on the tangent space of the unit sphere; q is
+    renormalised after each step, and a step that does not lower the cost is damped.
+    """
+    q = matrix_to_quat(R)
+    eye = torch.eye(4, dtype=q.dtype, device=q.device)
+    cost, gradient, curvature = quaternion_derivatives(gram, q)
+    damping = torch.full_like(cost, 1e-9)
+    for _ in range(QUATERNION_STEPS):
+        radial = q[:, :, None] * q[:, None]
+        tangent = eye - radial
+        size = curvature.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]
+        system = tangent @ curvature @ tangent + size * (radial + damping[:, None, None] * eye)
+        step = -torch.linalg.solve(system, (tangent @ gradient[..., None]))[..., 0]
+        length = torch.linalg.vector_norm(step, dim=-1, keepdim=True)
+        step = step * (MAX_QUATERNION_STEP / length.clamp_min(MAX_QUATERNION_STEP))
+        proposal = torch.nn.functional.normalize(q + step, dim=-1)
+        new_cost, new_gradient, new_curvature = quaternion_derivatives(gram, proposal)
+        better = new_cost <= cost
+        moving = (step.abs().amax(-1) > QUATERNION_TOLERANCE) & (damping < MAX_QUATERNION_DAMPING)
+        q = torch.where(better[:, None], proposal, q)
+        if not bool(moving.any()):
+            break
+        cost = torch.where(better, new_cost, cost)
+        gradient = torch.where(better[:, None], new_gradient, gradient)
+        curvature = torch.where(better[:, None, None], new_curvature, curvature)
+        damping = torch.where(better, damping * 0.1, damping.clamp_min(1e-4) * 10.0).clamp_min(1e-9)
+    return quat_to_matrix(q)
+
+
+def quaternion_derivatives(
+    gram: Float[Tensor, "b 9 9"], q: Float[Tensor, "b 4"]
+) -> tuple[Float[Tensor, " b"], Float[Tensor, "b 4"], Float[Tensor, "b 4 4"]]:
+    """Cost r^T M r of r = vec(R(q)) at unit q, its gradient, and its Gauss-Newton curvature.
+
+    The homogeneous form of R(q), which is R(q) on the unit sphere, is quadratic: its Jacobian J is linear in q, and
+    r = J q / 2 (Euler). So with P = J^T M J the cost is q^T P q / 4, the gradient P q and the curvature 2 P. Off the
+    tangent space of the sphere they differ from those of R(q / |q|), which has no slope there.
+    """
+    J = (q @ _quaternion_map(q.dtype, q.device)).unflatten(-1, (9, 4))
+    P = J.mT @ gram @ J
+    gradient = (P @ q[..., None])[..., 0]
+    return 0.25 * (q * gradient).sum(-1), gradient, 2.0 * P
+
+
+@lru_cache(maxsize=4)
+def _quaternion_map(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "4 36"]:
+    """d vec(R(q)) / dq of the homogeneous form, (9, 4) row by row, as a linear function of q = (w, x, y, z)."""
+    signs = (  # entry (row of vec(R), column): component of q, 1 to 4 for w to z, with its sign
+        (1, 2, -3, -4), (4, 3, 2, 1), (-3, 4, -1, 2),
+        (-4, 3, 2, -1), (1, -2, 3, -4), (2, 1, 4, 3),
+        (3, 4, 1, 2), (-2, -1, 4, 3), (1, -2, -3, 4),
+    )  # fmt: skip
+    out = torch.zeros(4, 9, 4, dtype=dtype, device=device)
+    for i, row in enumerate(signs):
+        for j, component in enumerate(row):
+            out[abs(component) - 1, i, j] = 2.0 if component > 0 else -2.0
+    return out.flatten(1)
+
+
+def solve_paper(statistics: LineStatistics) -> tuple[Float[Tensor, "b c 3 3"], Float[Tensor, "b c 3"]]:
+    """The estimate of each camera on its own (`camera_right_T_arm` both times)."""
+    gram = statistics.rotation_gram.flatten(0, 1)
+    R = refine_quaternion(gram, linear_rotation(gram)).unflatten(0, statistics.rotation_gram.shape[:2])
+    t, _ = solve_translation(statistics.apart(), R.flatten(0, 1)[:, None])
+    return R, t[:, 0].unflatten(0, R.shape[:2])
+
+
+def average(
+    R: Float[Tensor, "b c 3 3"], t: Float[Tensor, "b c 3"]
+) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"]]:
+    """Last line of Algorithm 1: chordal mean of the rotations, mean of the translations."""
+    return chordal_mean(R), t.mean(1)
+
+
+def influence(problem: Problem, R: Float[Tensor, "b c 3 3"], t: Float[Tensor, "b c 3"]) -> Float[Tensor, "b n 6"]:
+    """Each motion's share in the error of the two-step estimate (rotation, then translation).
+
+    With one R and t a camera (c > 1), each camera's own estimate from its own lines, and the mean of their shares; with
+    c = 1, one estimate from the lines of all cameras.
+
+    The estimate solves sum psi_1 = 0, psi_1 = (R v x n)(n.R v), and sum psi_2 = 0, psi_2 = n (n.(R p + t + o)). To
+    first order the error is -A^-1 sum psi with A the block-triangular derivative: dphi = -H1^-1 sum psi_1, dt = -H2^-1
+    (sum psi_2 + B dphi). The empirical covariance is the sum of squared shares: it needs no noise model (White 1980).
+    """
+    b, estimates = R.shape[:2]
+    n, _, ok = plane_normals(problem)
+    R_Z, t_Z = problem.camera_T_camera_right[..., :3, :3], problem.camera_T_camera_right[..., :3, 3]
+    offset = (R_Z.mT @ t_Z[..., None])[..., 0]
+    arm_v = (problem.arm_T_rcm[..., :3, :3] @ problem.rcm_v_axis[..., None])[..., 0]
+    v, turned = ((x[:, None] @ R.mT).flatten(0, 1)[:, None] for x in (arm_v, problem.arm_T_rcm[..., :3, 3]))
+    # Estimates of each camera become trials of one camera; (b e, c / e, n, 3) from here.
+    n, ok, offset = (x.reshape(b * estimates, -1, *x.shape[2:]) for x in (n, ok, offset))
+    known = ok.to(n.dtype)[..., None]
+    j = torch.linalg.cross(v.expand_as(n), n) * known  # d(n.Rv)/dphi
+    e1 = (n * v).sum(-1, keepdim=True)
+    e2 = (n * (turned + t.flatten(0, 1)[:, None, None] + offset[:, :, None])).sum(-1, keepdim=True)
+    k = torch.linalg.cross(turned.expand_as(n), n)
+    weighted = n * known
+    H1, H2 = _outer(j, j), _outer(weighted, n)
+    B = _outer(weighted, k)
+    psi1, psi2 = (j * e1).sum(1), (weighted * e2).sum(1)
+    eye = 1e-12 * torch.eye(3, dtype=n.dtype, device=n.device)
+    phi = -torch.linalg.solve(H1 + eye * H1.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None], psi1.mT).mT
+    shift = -torch.linalg.solve(
+        H2 + eye * H2.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None], (psi2 + phi @ B.mT).mT
+    ).mT
+    return torch.cat((phi, shift), dim=-1).unflatten(0, (b, estimates)).mean(1)
+
+
+def _outer(a: Float[Tensor, "b c n 3"], b: Float[Tensor, "b c n 3"]) -> Float[Tensor, "b 3 3"]:
+    """Sum of a b^T over cameras and motions."""
+    return a.flatten(1, 2).mT @ b.flatten(1, 2)
+
+
+def empirical_covariance(shares: Float[Tensor, "b n 6"]) -> Float[Tensor, "b 6 6"]:
+    """Sum of the outer products of the shares, with the degrees of freedom of 6 parameters restored."""
+    n = shares.shape[-2]
+    return shares.mT @ shares * (n / max(n - 6, 1))

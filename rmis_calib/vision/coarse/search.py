@@ -1,0 +1,175 @@
+"""Coarse search: from a batch of pictures to a few strips a frame that may be shafts.
+
+Each frame of a video is searched anew. Lines of the frame before could spare edges, votes and most strips: 30 per cent
+of the processor time of a picture of 1280 x 720 px, 26 with every eighth frame searched in full. But an instrument that
+enters would go unseen until then, for only what is spared would show it, and batches would have to wait for each other.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from rmis_calib.vision.coarse import appearance, hough, scoring, strips, trace
+from rmis_calib.vision.image.canvas import Canvas, shrink
+from rmis_calib.vision.settings import DetectorSettings
+
+_LINES, _PAIRS, _STRIPS = 48, 160, 20
+# Blurred ridges of the field's border reach this far into it, small px.
+_RIM_PX = 4
+_LIT_MERIT = 0.75
+# A strip of the dark view that lies on one of the lit view: below this share of its width it is a part of the shaft,
+# between the other two it has a shadow; and the merit that is left to it.
+_PART_OF_LIT, _SHADOWED = 0.6, (1.1, 1.6)
+_PART_MERIT = 0.5
+# A ridge below this is texture: 4 per cent of brightness a small pixel.
+_MIN_GRADIENT = 0.04
+
+
+@dataclass(frozen=True, eq=False)
+class SearchTrace:
+    """What each stage of the search saw, for pictures that explain a result."""
+
+    rgb: Float[Tensor, "b 3 h w"]
+    seen: Bool[Tensor, "b h w"]
+    unlike: Float[Tensor, "b h w"]
+    lit: Float[Tensor, "b h w"]
+    """The last view of `appearance.shaft_contrast`."""
+    ridge: Bool[Tensor, "b h w"]
+    """Of any view."""
+    votes: Float[Tensor, "b angles rhos"]
+    lines: hough.HoughLines
+    evidence: scoring.Evidence
+    scores: Float[Tensor, "b k"]
+    leads: Float[Tensor, "b c"]
+    """Scores of the strips that are measured, the best first."""
+    factor: int
+    """Full-resolution pixels a small one."""
+    origin: tuple[float, float]
+    """Ideal pixel of the first small pixel."""
+
+
+@dataclass(frozen=True, eq=False)
+class StripCandidates:
+    """Strips that may be shafts, the best first in each frame."""
+
+    trace: trace.Trace
+    """The kept ones as one list, (1, m)."""
+    frame: Int64[Tensor, "1 m"]
+    """Picture that each of the list lies in."""
+    keep: Bool[Tensor, "b c"]
+    """Which ranks of which frames are in the list; at least one."""
+    scores: Float[Tensor, "b c"]
+    """0 for none."""
+
+
+def search(
+    images: Tensor, canvas: Canvas, settings: DetectorSettings, looks: int, masks: Tensor | None = None
+) -> tuple[StripCandidates, SearchTrace]:
+    """The best strips of each frame, at most `max_shafts`, with their contours traced, and the stages that led there.
+
+    Args:
+        images: (b, 3, H, W), uint8 or floating point in [0, 1].
+        canvas: the small picture's place.
+        settings: limits of width, contrast, convergence.
+        looks: views of each picture that are searched, 1 or 2 (appearance.py); masks are a single one.
+        masks: (b, H, W), 1 on shafts, which replace the colour stage.
+    """
+    small = shrink(images, canvas.factor)
+    field, within = appearance.field_of_view(small, settings.black_level, _RIM_PX)
+    rgb, seen, well_inside = _lay_out(canvas, small, field, within)
+    if masks is None:
+        views, tone = appearance.shaft_contrast(rgb, seen, looks)
+    else:
+        inside = canvas.lay_out(shrink(masks[:, None].to(torch.float32), canvas.factor))
+        views, tone = appearance.smooth(1 - inside[:, 0])[:, None], torch.zeros_like(inside[:, 0])
+    # Each view is searched as a frame of its own, until the best strips of each picture are chosen.
+    count = views.shape[1]
+    unlike, around, well_inside, tones = (
+        views.flatten(0, 1),
+        *(layer.repeat_interleave(count, 0) for layer in (seen, well_inside, tone)),
+    )
+    ridge, edges = _edges(unlike, well_inside)
+    votes = hough.vote(edges, len(unlike), canvas.half_diagonal_px / canvas.factor + 2)
+    lines = hough.refine(edges, hough.peaks(votes, _LINES))
+    layers = torch.stack([unlike, around.to(unlike.dtype), tones])
+    picture = strips.SmallPicture(layers, count, canvas, images.shape[-1])
+    lines = hough.HoughLines(lines.normal, lines.rho * canvas.factor, lines.votes)
+    # Masks have no texture: a strip that is too wide looks as good at a glance as the right one, so none is left out.
+    count_pairs = _STRIPS if masks is None else _PAIRS
+    pairs = scoring.screen(picture, strips.pair(lines, picture, settings, _PAIRS), settings, count_pairs)
+    evidence = scoring.inspect(picture, pairs, settings)
+    scores = scoring.score(evidence, settings)
+    found = _best(picture, evidence, scores, settings, settings.max_shafts)
+    ridge, votes = ridge.unflatten(0, (-1, count)).any(1), votes.unflatten(0, (-1, count)).amax(1)
+    lines = hough.HoughLines(**{n: v.unflatten(0, (-1, count)).flatten(1, 2) for n, v in vars(lines).items()})
+    evidence, scores = evidence.views_together(count), scores.unflatten(0, (-1, count)).flatten(1, 2)
+    pictures = (rgb, seen, views[:, 0], views[:, -1], ridge, votes)
+    return found, SearchTrace(*pictures, lines, evidence, scores, found.scores, canvas.factor, canvas.origin)
+
+
+def _best(
+    picture: strips.SmallPicture,
+    evidence: scoring.Evidence,
+    scores: Float[Tensor, "v k"],
+    settings: DetectorSettings,
+    wanted: int,
+) -> StripCandidates:
+    """The best strips of each view, traced; and of these the best of each picture, traced once more.
+
+    A strip of one view that lies on one of another competes by how straight its contours are.
+    """
+    index, best = scoring.distinct(evidence, scores, wanted)
+    few = evidence.pick(index).views_together(picture.views)
+    best = best.reshape(-1, picture.views * wanted)
+    keep = best > 0
+    keep[0, 0] |= ~keep.any()  # an empty list would have no medians
+    straight, wander = trace.straighten(trace.trace(picture, few.strips.listed(keep), settings))
+    merit = torch.zeros_like(best)
+    merit[keep] = best[keep] / (1 + (wander / (0.02 * few.width[keep] + picture.factor)).square())[0]
+    lit = few.strips.frame % picture.views > 0
+    merit = torch.where(lit, _LIT_MERIT * merit, merit)
+    # Between a contour and a stripe of glare lies a dark strip too, as straight as the shaft that holds it; and a shaft
+    # with its shadow is another, a little wider.
+    over = scoring.lies_on(few) & lit[:, None] & ~lit[:, :, None] & (merit > 0)[:, None]  # dark (first) on lit (second)
+    share = few.width[:, :, None] / few.width[:, None].clamp(min=1e-6)
+    wrong = over & ((share < _PART_OF_LIT) | ((share > _SHADOWED[0]) & (share < _SHADOWED[1])))
+    merit = torch.where(wrong.any(-1), _PART_MERIT * merit, merit)
+    index, best = scoring.distinct(few, merit, wanted)
+    place = torch.zeros_like(keep, dtype=torch.int64)
+    place[keep] = torch.arange(straight.frame.shape[1], device=place.device)
+    chosen = best > 0
+    chosen[0, 0] |= ~chosen.any()
+    listed = straight.pick(place.gather(1, index)[chosen][None])
+    # Once more around lines through what was traced: the pair of Hough lines may have followed a short stretch only.
+    return StripCandidates(trace.trace(picture, listed, settings), listed.frame // picture.views, chosen, best)
+
+
+def _lay_out(
+    canvas: Canvas, small: Float[Tensor, "b 3 h w"], field: Bool[Tensor, "b h w"], within: Bool[Tensor, "b h w"]
+) -> tuple[Float[Tensor, "b 3 h2 w2"], Bool[Tensor, "b h2 w2"], Bool[Tensor, "b h2 w2"]]:
+    """The shrunken picture, its field of view and the inner part of that, in ideal pixels."""
+    if canvas.covered is None:
+        return small, field, within
+    stack = canvas.lay_out(torch.cat([small, field[:, None].to(small.dtype), within[:, None].to(small.dtype)], 1))
+    return stack[:, :3], (stack[:, 3] > 0.5) & canvas.covered, (stack[:, 4] > 0.99) & canvas.covered
+
+
+def _edges(
+    unlike: Float[Tensor, "b h w"], well_inside: Bool[Tensor, "b h w"]
+) -> tuple[Bool[Tensor, "b h w"], hough.EdgePixels]:
+    """Thin ridges of the gradient inside the field of view, in small pixels from the middle of the canvas."""
+    gu, gv = hough.gradients(unlike)
+    magnitude = torch.sqrt(gu * gu + gv * gv)
+    strong = ((magnitude > _MIN_GRADIENT) & well_inside).flatten().nonzero()[:, 0]
+    height, width = unlike.shape[1:]
+    frame, row, column = strong // (height * width), strong // width % height, strong % width
+    gradient = torch.stack([gu.flatten()[strong], gv.flatten()[strong]], -1)
+    top = hough.thin(magnitude, frame, row, column, *gradient.unbind(-1)).nonzero()[:, 0]
+    ridge = torch.zeros_like(well_inside)
+    ridge.view(-1)[strong[top]] = True
+    strength = magnitude.flatten()[strong[top]]
+    middle = strength.new_tensor([(width - 1) / 2, (height - 1) / 2])
+    uv = torch.stack([column[top], row[top]], -1).to(strength.dtype) - middle
+    return ridge, hough.EdgePixels(frame[top], uv, gradient[top] / strength[:, None], strength / (strength + 0.15))

@@ -1,0 +1,159 @@
+"""Strips between two nearly parallel lines: the candidates for a shaft, and what the small picture says for them.
+
+A strip has its own frame: station t along it, lateral y to the *left* of its direction (the picture's x
+points right and y down). Contours are y = offset + slope * t. All lengths are full-resolution ideal pixels.
+"""
+
+from dataclasses import dataclass, fields, replace
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from rmis_calib.vision.coarse.hough import HoughLines
+from rmis_calib.vision.image.canvas import Canvas
+from rmis_calib.vision.image.sampling import sample
+from rmis_calib.vision.settings import DetectorSettings
+
+
+@dataclass(frozen=True, eq=False)
+class SmallPicture:
+    """The small picture of a batch, and how to read it at full-resolution ideal pixels."""
+
+    layers: Float[Tensor, "3 b h w"]
+    """Unlikeness to a shaft; 1 inside the field of view, else 0; log brightness. The views of a picture follow one
+    another as frames of their own."""
+    views: int
+    """How many: the dark one, or the dark and the lit one."""
+    canvas: Canvas
+    width_px: int
+    """Width of the raw picture."""
+
+    @property
+    def factor(self) -> int:
+        """Full-resolution pixels a small one."""
+        return self.canvas.factor
+
+    @property
+    def half_diagonal_px(self) -> float:
+        """Reach of a line from the middle, full-resolution px."""
+        return self.canvas.half_diagonal_px
+
+    def lit(self, strips: "Strips") -> Bool[Tensor, "b k"]:
+        """Which strips are seen in the lit view."""
+        return strips.frame % self.views > 0
+
+    def read(
+        self, strips: "Strips", t: Float[Tensor, "b k *#points"], y: Float[Tensor, "b k *#points"]
+    ) -> tuple[Float[Tensor, "b k *points"], Bool[Tensor, "b k *points"], Float[Tensor, "b k *points"]]:
+        """Unlikeness at (station, lateral) pairs, whether they lie in the field of view, and log brightness.
+
+        The frames lie below one another in one tall picture, so that strips of all of them are read in one call.
+        """
+        height, width = self.canvas.size
+        ones = [1] * (max(t.ndim, y.ndim) - 2)
+        first = (strips.origin - strips.origin.new_tensor(self.canvas.origin)) / self.factor
+        u, v = (
+            torch.addcmul(
+                torch.addcmul(origin.reshape(*origin.shape, *ones), t, along.reshape(*origin.shape, *ones)),
+                y,
+                left.reshape(*origin.shape, *ones),
+            )
+            for origin, along, left in zip(
+                first.unbind(-1),
+                (strips.along / self.factor).unbind(-1),
+                (strips.left / self.factor).unbind(-1),
+                strict=True,
+            )
+        )
+        near = (u >= -0.5) & (v >= -0.5) & (u <= width - 0.5) & (v <= height - 0.5)
+        v = v.clamp_(0, height - 1).add_(strips.frame.reshape(*strips.frame.shape, *ones) * height)
+        unlike, field, tone = sample(self.layers.flatten(1, 2), u, v)
+        return unlike, (field > 0.75).logical_and_(near), tone
+
+
+@dataclass(frozen=True, eq=False)
+class Strips:
+    """k candidate strips a frame, or some strips of all frames as one list, (1, m)."""
+
+    frame: Int64[Tensor, "b k"]
+    origin: Float[Tensor, "b k 2"]
+    """Point of the middle line nearest to the centre of the picture."""
+    along: Float[Tensor, "b k 2"]
+    """Unit direction of growing t."""
+    offset: Float[Tensor, "b k 2"]
+    """Lateral place of [left, right] contour at t = 0."""
+    slope: Float[Tensor, "b k 2"]
+    """Slope of [left, right] contour."""
+    valid: Bool[Tensor, "b k"]
+
+    @property
+    def left(self) -> Float[Tensor, "b k 2"]:
+        """Unit lateral direction."""
+        return torch.stack([self.along[..., 1], -self.along[..., 0]], -1)
+
+    def contour(self, t: Float[Tensor, "b k s"]) -> Float[Tensor, "b k 2 s"]:
+        """Lateral place of [left, right] contour at stations."""
+        return self.offset[..., None] + self.slope[..., None] * t[..., None, :]
+
+    def points(self, t: Float[Tensor, "b k *s"], y: Float[Tensor, "b k *s"]) -> Float[Tensor, "b k *s 2"]:
+        """Ideal pixels of (station, lateral) pairs."""
+        shape = (*t.shape[:2], *[1] * (t.ndim - 2), 2)
+        return (
+            self.origin.reshape(shape)
+            + t[..., None] * self.along.reshape(shape)
+            + y[..., None] * self.left.reshape(shape)
+        )
+
+    def pick(self, index: Tensor) -> "Strips":
+        """The strips with these indices, (b, k') int64."""
+        wide = index[..., None].expand(*index.shape, 2)
+        return Strips(
+            frame=self.frame.gather(1, index),
+            origin=self.origin.gather(1, wide),
+            along=self.along.gather(1, wide),
+            offset=self.offset.gather(1, wide),
+            slope=self.slope.gather(1, wide),
+            valid=self.valid.gather(1, index),
+        )
+
+    def listed(self, keep: Bool[Tensor, "b k"]) -> "Strips":
+        """The kept strips of all frames as one list, (1, m)."""
+        return Strips(**{field.name: getattr(self, field.name)[keep][None] for field in fields(self)})
+
+    def reverse(self, where: Bool[Tensor, "b k"]) -> "Strips":
+        """The same strips walked the other way round where asked: left and right change places."""
+        flip = where[..., None]
+        return replace(
+            self,
+            along=torch.where(flip, -self.along, self.along),
+            offset=torch.where(flip, -self.offset.flip(-1), self.offset),
+            slope=torch.where(flip, self.slope.flip(-1), self.slope),
+        )
+
+
+def pair(lines: HoughLines, picture: SmallPicture, settings: DetectorSettings, count: int) -> Strips:
+    """Up to `count` most voted pairs of lines that could be the contours of one cylinder.
+
+    They face away from each other, converge little, and enclose a plausible width near the middle of the picture.
+    """
+    first, second = torch.triu_indices(lines.rho.shape[1], lines.rho.shape[1], 1, device=lines.rho.device)
+    n_a, n_b = lines.normal[:, first], lines.normal[:, second]
+    rho_a, rho_b = lines.rho[:, first], lines.rho[:, second]
+    left = n_a - n_b
+    left = left / left.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+    along = torch.stack([-left[..., 1], left[..., 0]], -1)
+    cos_a, cos_b = (n_a * left).sum(-1), -(n_b * left).sum(-1)
+    slope = torch.stack([-(n_a * along).sum(-1) / cos_a, (n_b * along).sum(-1) / cos_b], -1)
+    offset = torch.stack([rho_a / cos_a, -rho_b / cos_b], -1)
+    width = (offset[..., 0] - offset[..., 1]) * 1.0
+    facing = (n_a * n_b).sum(-1) < -torch.cos(torch.deg2rad(width.new_tensor(settings.max_convergence_deg)))
+    size = float(picture.width_px)
+    fits = (width > settings.min_width_fraction * size) & (width < settings.max_width_fraction * size)
+    score = torch.minimum(lines.votes[:, first], lines.votes[:, second]) * (facing & fits)
+    best = score.topk(min(count, score.shape[1]), dim=1)
+    centre = width.new_tensor(picture.canvas.centre)
+    middle = offset.mean(-1, keepdim=True)
+    frame = torch.arange(score.shape[0], device=score.device)[:, None].expand_as(score)
+    strips = Strips(frame, centre + middle * left, along, offset - middle, slope, score > 0)
+    return strips.pick(best.indices[:, : max(1, int(strips.valid.sum(1).max()))])

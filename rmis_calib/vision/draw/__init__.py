@@ -1,0 +1,1 @@
+"""Pictures for people: what was found, and what each stage of the search saw."""

@@ -1,0 +1,97 @@
+"""Bilinear reading of pictures at many points, for a batch at once."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from rmis_calib.vision.image.pixel_mapping import Lens
+
+
+def sample(
+    layers: Float[Tensor, " c h w"], u: Float[Tensor, " *points"], v: Float[Tensor, " *points"]
+) -> Float[Tensor, " c *points"]:
+    """Values of each layer at pixel coordinates, bilinearly; points outside read the border.
+
+    Convention: pixel (0, 0) is the centre of the top-left pixel.
+    """
+    height, width = layers.shape[-2:]
+    place = torch.stack([u * (2.0 / max(width - 1, 1)) - 1.0, v * (2.0 / max(height - 1, 1)) - 1.0], -1)
+    place = place.reshape(1, 1, -1, 2)
+    values = grid_sample(layers[None], place, mode="bilinear", padding_mode="border", align_corners=True)
+    return values.reshape(layers.shape[0], *u.shape)
+
+
+def inside(
+    uv: Float[Tensor, "*points 2"], image_size: tuple[int, int], margin_px: float = 0.0
+) -> Bool[Tensor, "*points"]:
+    """Whether points lie in the picture, at least `margin_px` from the centres of its outermost pixels."""
+    height, width = image_size
+    u, v = uv.unbind(-1)
+    return (u >= margin_px) & (v >= margin_px) & (u <= width - 1 - margin_px) & (v <= height - 1 - margin_px)
+
+
+@dataclass(frozen=True, eq=False)
+class FullPicture:
+    """Pictures at full resolution, as they came, and which of them each strip lies in."""
+
+    images: Tensor
+    """(n, 3, h, w), uint8 or single precision in [0, 1]; channels last in memory, as videos are decoded."""
+    frame: Tensor
+    """(b, k) int64: frame of each strip."""
+    lens: Lens
+
+    def read(
+        self, ideal: Float[Tensor, "b k *points 2"]
+    ) -> tuple[Float[Tensor, "3 b k *points"], Bool[Tensor, "b k *points"]]:
+        """Colours in [0, 1] at ideal pixels, bilinearly, and whether they lie in the picture."""
+        raw = self.lens.to_raw(ideal)
+        return self._gather(raw[..., 0], raw[..., 1]), inside(raw, (self.images.shape[-2], self.images.shape[-1]))
+
+    def read_across(
+        self, middle: Float[Tensor, "b k e p 2"], outward: Float[Tensor, "b k e 2"], offsets: Float[Tensor, "b k e d"]
+    ) -> tuple[Float[Tensor, "3 b k e p d"], Bool[Tensor, "b k e p"]]:
+        """Colours along short profiles, and whether all of each lies in the picture.
+
+        The lens is asked at three places of a profile, and a parabola gives the others: over twenty pixels that is
+        good to a thousandth of a pixel for the strongest lens of the presets (k1 = -0.35), and no work otherwise.
+
+        Args:
+            middle: ideal pixels.
+            outward: unit direction of the profiles.
+            offsets: places along them from `middle`, px, rising, symmetric.
+        """
+        reach = offsets[..., -1:, None, None]
+        sides = middle.new_tensor([-1.0, 0.0, 1.0])[:, None]
+        knots = self.lens.to_raw(middle[:, :, :, :, None] + reach * sides * outward[:, :, :, None, None])
+        z = offsets / offsets[..., -1:]
+        parabola = torch.stack([0.5 * z * (z - 1), 1 - z * z, 0.5 * z * (z + 1)], -2)  # (b, k, e, 3, d)
+        u, v = (knots[..., i] @ parabola for i in (0, 1))
+        return self._gather(u, v), inside(knots, (self.images.shape[-2], self.images.shape[-1])).all(-1)
+
+    def _gather(self, u: Float[Tensor, "b k *points"], v: Float[Tensor, "b k *points"]) -> Tensor:
+        """Colours (3, b, k, *points) at raw pixels.
+
+        Gathers from the picture's own bytes: turning it into floating point first costs more than all that is read.
+        A pixel and its right neighbour are six consecutive values, and rows of six are fetched four times as fast as
+        single values.
+        """
+        height, width = self.images.shape[-2:]
+        # A strip that no contour supports may have no place: it reads the corner and is not inside.
+        u, v = torch.nan_to_num(u).clamp(0, width - 1.001), torch.nan_to_num(v).clamp(0, height - 1.001)
+        column, row = u.to(torch.int64), v.to(torch.int64)
+        frame = self.frame.reshape(*self.frame.shape, *[1] * (u.ndim - 2))
+        at = ((frame * height + row) * width + column).reshape(-1)
+        pixels = self.images.permute(0, 2, 3, 1).reshape(-1)
+        pairs = pixels.as_strided((pixels.numel() // 3 - 1, 6), (3, 1))
+        du, dv = (u - column).reshape(-1), (v - row).reshape(-1)
+        rows = []
+        for shift in (0, width):
+            pair = pairs.index_select(0, at + shift).T.to(torch.float32, memory_format=torch.contiguous_format)
+            rows.append(torch.lerp(pair[:3], pair[3:], du))
+        colours = torch.lerp(rows[0], rows[1], dv)
+        if self.images.dtype == torch.uint8:
+            colours *= 1.0 / 255.0
+        return colours.reshape(3, *u.shape)

@@ -1,0 +1,56 @@
+"""Joint offsets and the clock, with the kinematics as a function."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from rmis_calib.solver import SolverSettings, solve
+from rmis_calib.solver.estimate.relinearise import scan_clock
+from rmis_calib.solver.settings import UnknownSettings
+from tests.benchmarks.bench_solver_nuisance import record
+
+KNOWN = UnknownSettings(radius_sigma_relative=0.0, stereo=False, joint_offsets="never")
+ZERO = torch.zeros(1, 6, dtype=torch.float64)
+STILL = torch.zeros(1, dtype=torch.float64)
+
+
+def kinematics_of(recorded):
+    return lambda joints, clock: recorded.kinematics(joints, clock).only("contours", "ends")
+
+
+@pytest.mark.parametrize("clock_s", [0.04, -2.4])
+def test_clock_offset_is_found(clock_s):
+    recorded, truth = record(1, 120, 3, clock_s=clock_s)
+    kinematics = kinematics_of(recorded)
+    candidates = torch.arange(-3.0, 3.01, 0.1, dtype=torch.float64)
+    found, _ = scan_clock(recorded.kinematics, 6, candidates)
+    assert found == pytest.approx(clock_s, abs=0.11)
+    solution = solve(
+        kinematics(ZERO, STILL + found), SolverSettings(unknowns=replace(KNOWN, clock=True)), kinematics=kinematics
+    )
+    clock = solution.nuisances["clock"]
+    assert float(clock.value) == pytest.approx(clock_s, abs=4.0 * float(clock.sigma))
+    assert float(clock.sigma) < 0.005
+    gap = torch.linalg.vector_norm(solution.camera_right_T_arm[0, :3, 3] - truth[0, :3, 3])
+    assert float(gap) < 3.5 * float(solution.translation_sigma_mm)
+
+
+def test_joint_offsets_are_estimated_or_held():
+    offset = torch.tensor([0.0087, -0.0087, 1.0, -0.0087, 0.0087, -1.0], dtype=torch.float64)
+    recorded, truth = record(1, 200, 4, offset=offset.numpy())
+    kinematics = kinematics_of(recorded)
+    start = kinematics(ZERO, STILL)
+    ignored = solve(start, SolverSettings(unknowns=KNOWN))
+    solution = solve(start, SolverSettings(unknowns=replace(KNOWN, joint_offsets="always")), kinematics=kinematics)
+    estimate = solution.nuisances["joint_offset"]
+    assert bool(((estimate.value[0] - offset).abs() < 4.0 * estimate.sigma[0]).all())
+    seen = ~estimate.held[0]
+    assert bool(seen.any()) and not bool(seen.all())  # insertion of the laparoscope is not told from the transform
+    gap = torch.linalg.vector_norm((solution.camera_right_T_arm - truth)[0, :3, 3])
+    assert float(gap) < 3.5 * float(solution.translation_sigma_mm)
+    assert float(gap) < float(torch.linalg.vector_norm((ignored.camera_right_T_arm - truth)[0, :3, 3]))
