@@ -9,7 +9,7 @@ from torch import Tensor
 from rmis_calib.errors import InputError, InsufficientDataError, ObservationsError
 from rmis_calib.solver.assess.assemble import CHECKED_MOTIONS, SHOWN_MOTIONS, joint_solution, two_step_solution
 from rmis_calib.solver.assess.information import motion_information, select_d_optimal
-from rmis_calib.solver.estimate.map_estimate import solve_joint
+from rmis_calib.solver.estimate.map_estimate import map_estimate
 from rmis_calib.solver.estimate.relinearise import Kinematics, solve_relinearised
 from rmis_calib.solver.model.measurement_rows import pack
 from rmis_calib.solver.problem import MIN_MOTIONS, Problem
@@ -85,7 +85,7 @@ def _solve_flat(
     if settings.thin_to is not None and settings.thin_to < flat.n_motions:
         index, kept = _informative(flat, settings, settings.thin_to)
         chosen = flat.select_motions(index)
-    fit = solve_joint(chosen, settings) if kinematics is None else solve_relinearised(chosen, settings, kinematics)
+    fit = map_estimate(chosen, settings) if kinematics is None else solve_relinearised(chosen, settings, kinematics)
     solution = joint_solution(fit, settings, alternative)
     return solution if index is None else replace(_spread(solution, index, flat.n_motions), information_kept=kept)
 
@@ -117,19 +117,16 @@ def _informative(flat: Problem, settings: SolverSettings, count: int) -> tuple[I
     """
     if flat.n_trials != 1:
         raise InputError(where="thin_to", expected="a single trial", found=f"{flat.n_trials} trials")
-    first = solve_joint(
+    first = map_estimate(
         flat.select_motions(slice(None, None, max(1, flat.n_motions // max(count, CHECKED_MOTIONS)))), settings
     )
-    packed = pack(flat, settings.noise)
-    information = torch.cat(
-        [
-            motion_information(
-                packed.narrow(slice(None), slice(n, n + settings.chunk)), first.state, first.layout, first.noise
-            )[0]
-            for n in range(0, flat.n_motions, settings.chunk)
-        ]
-    )
-    return select_d_optimal(information, torch.diag(first.layout.sigma[0].square().reciprocal()), count)
+    model = replace(first.model, measured=pack(flat, settings.noise), weight=None)
+    whole = slice(None)
+    parts = [
+        motion_information(model.narrow(whole, part), first.state)[0] for _, along in model.parts() for part in along
+    ]
+    information = torch.cat(parts)
+    return select_d_optimal(information, torch.diag(first.model.layout.sigma[0].square().reciprocal()), count)
 
 
 def _spread(solution: Solution, index: Int[Tensor, " k"], n: int) -> Solution:

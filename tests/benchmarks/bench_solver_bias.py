@@ -25,7 +25,7 @@ import torch
 from rmis_calib.solver import SolverSettings
 from rmis_calib.solver.estimate.bias import _Draws, _turned, simulate
 from rmis_calib.solver.estimate.gauss_newton import solve_system
-from rmis_calib.solver.estimate.map_estimate import JointFit, solve_joint
+from rmis_calib.solver.estimate.map_estimate import MapEstimate, map_estimate
 from rmis_calib.solver.model.batched_linalg import batch_last, dot, rotate, rotate_back, unit
 from rmis_calib.solver.model.measurement_rows import MeasurementRows
 from rmis_calib.solver.model.normal_equations import NoiseModel, covariance, image_variance
@@ -52,20 +52,20 @@ CELLS = [
 STEPS = 8
 
 
-def gauss_helmert(packed: MeasurementRows, state: State, layout: ParameterLayout, noise: NoiseModel) -> State:
+def gauss_helmert(measured: MeasurementRows, state: State, layout: ParameterLayout, noise: NoiseModel) -> State:
     """Transform and latent poses together: each step solves the rows linearised at the latent poses, then moves
     these."""
-    shift, turn = torch.zeros_like(packed.p), torch.zeros_like(packed.p)
-    D = image_variance(packed, noise)
+    shift, turn = torch.zeros_like(measured.p), torch.zeros_like(measured.p)
+    D = image_variance(measured, noise)
     for _ in range(STEPS):
-        latent = replace(packed, p=packed.p + shift, v=unit(_turned(packed.v, turn)))
+        latent = replace(measured, p=measured.p + shift, v=unit(_turned(measured.v, turn)))
         rows, shaft = linearise(latent, state)
         R = batch_last(state.R, 2)[..., None]
         r = rows.r - dot(rows.w, rotate(R, shift)[:, None]) - dot(rows.a, rotate(R, turn)[:, None])
         J = columns(layout, rows, shaft, latent, state)
         k, b, n = r.shape
         S = torch.empty((k, k, b, n), dtype=r.dtype)
-        covariance(rows.w, rows.a, D, packed.cameras, noise, S)
+        covariance(rows.w, rows.a, D, measured.cameras, noise, S)
         factor = torch.linalg.cholesky(S.permute(2, 3, 0, 1))
         white = torch.cholesky_solve(torch.cat((J, r[:, None]), 1).permute(2, 3, 0, 1), factor)  # (b, n, k, p + 1)
         both = J.permute(2, 3, 1, 0) @ white
@@ -80,14 +80,16 @@ def gauss_helmert(packed: MeasurementRows, state: State, layout: ParameterLayout
     return state
 
 
-def bootstrapped(fit: JointFit, state: State, pairs: int, seed: int) -> State:
+def bootstrapped(fit: MapEstimate, state: State, pairs: int, seed: int) -> State:
     """The state less the mean error of Gauss-Helmert on data simulated at it, in pairs of opposite noise."""
     generator = torch.Generator().manual_seed(seed)
-    twice = torch.arange(fit.packed.trials).repeat(2)
-    twofold = state.take(twice), fit.layout.take(twice), fit.noise.take(twice)
-    total = torch.zeros(fit.packed.trials, 6, dtype=state.t.dtype)
+    twice = torch.arange(fit.model.measured.trials).repeat(2)
+    twofold = state.take(twice), fit.model.layout.take(twice), fit.model.noise.take(twice)
+    total = torch.zeros(fit.model.measured.trials, 6, dtype=state.t.dtype)
     for _ in range(pairs):
-        simulated = simulate(fit.packed.take_trials(twice), twofold[0], twofold[2], _Draws(fit.packed, generator))
+        simulated = simulate(
+            fit.model.measured.take_trials(twice), twofold[0], twofold[2], _Draws(fit.model.measured, generator)
+        )
         again = gauss_helmert(simulated, *twofold)
         total += errors(pose(again), pose(twofold[0])).unflatten(0, (2, -1)).mean(0)
     return state.moved({"rotation": -total[:, :3] / pairs, "translation": -total[:, 3:] / pairs})
@@ -113,14 +115,14 @@ def main() -> int:
         trial = study(config(noise, args.trials, 1), ("axis",))
         problem = trial.problem.flatten_batch()
         start = time.perf_counter()
-        fit = solve_joint(problem, replace(settings, bias_correction=False))
+        fit = map_estimate(problem, replace(settings, bias_correction=False))
         times = [time.perf_counter() - start]
-        helmert = gauss_helmert(fit.packed, fit.state, fit.layout, fit.noise)
+        helmert = gauss_helmert(fit.model.measured, fit.state, fit.model.layout, fit.model.noise)
         times.append(time.perf_counter() - start)
         corrected = bootstrapped(fit, helmert, args.pairs, 7)
         times.append(time.perf_counter() - start)
         start = time.perf_counter()
-        joint = solve_joint(problem, settings)
+        joint = map_estimate(problem, settings)
         times.append(time.perf_counter() - start)
         for label, state, seconds in zip(
             ("marginal", "Gauss-Helmert", "+ bootstrap", "joint"),

@@ -83,20 +83,20 @@ def _error(estimate: torch.Tensor, trial: Study) -> str:
 def show_jacobians(trial: Study, settings: SolverSettings) -> None:
     """Residuals of all 1,728 motions with their Jacobian in the 13 unknowns: analytic, torch.func and autograd."""
     problem = trial.problem
-    packed = pack(problem, settings.noise)
+    measured = pack(problem, settings.noise)
     found = solve(problem, settings)
     X, end_offset = found.camera_right_T_arm, found.nuisances["end_offset"].value[:, 0]
     state = replace(initial_state(NuisancePriors.of(problem), X[:, :3, :3], X[:, :3, 3]), end_offset=end_offset)
-    layout = make_layout(NuisancePriors.of(problem), packed, state, settings.unknowns, settings.noise)
-    single = packed.gather(torch.zeros(packed.motions, dtype=torch.int64), torch.arange(packed.motions))
-    each = state.take(torch.zeros(packed.motions, dtype=torch.int64))
+    layout = make_layout(NuisancePriors.of(problem), measured, state, settings.unknowns, settings.noise)
+    single = measured.gather(torch.zeros(measured.motions, dtype=torch.int64), torch.arange(measured.motions))
+    each = state.take(torch.zeros(measured.motions, dtype=torch.int64))
 
     def analytic() -> torch.Tensor:
-        rows, shaft = linearise(packed, state)
-        return columns(layout, rows, shaft, packed, state)[:, :, 0]  # (k, p, n)
+        rows, shaft = linearise(measured, state)
+        return columns(layout, rows, shaft, measured, state)[:, :, 0]  # (k, p, n)
 
     def residuals(delta: torch.Tensor) -> torch.Tensor:
-        return residual_rows(packed, state.moved(layout.step(delta[None])))[:, 0]
+        return residual_rows(measured, state.moved(layout.step(delta[None])))[:, 0]
 
     def forward() -> torch.Tensor:
         zero = torch.zeros(layout.size, dtype=torch.float64)
@@ -104,7 +104,7 @@ def show_jacobians(trial: Study, settings: SolverSettings) -> None:
 
     def backward() -> torch.Tensor:
         """Every motion with unknowns of its own, so that one backward pass a row serves all motions."""
-        delta = torch.zeros(packed.motions, layout.size, dtype=torch.float64, requires_grad=True)
+        delta = torch.zeros(measured.motions, layout.size, dtype=torch.float64, requires_grad=True)
         r = residual_rows(single, each.moved(layout.step(delta)))[..., 0]
         rows = [torch.autograd.grad(row.sum(), delta, retain_graph=True)[0] for row in r]
         return torch.stack(rows).transpose(1, 2)

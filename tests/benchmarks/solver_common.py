@@ -15,7 +15,7 @@ from rmis_calib.geometry.rotations import matrix_to_rotvec
 from rmis_calib.solver import Problem, SolverSettings
 from rmis_calib.solver.estimate.noise_levels import assumed_noise
 from rmis_calib.solver.model.measurement_rows import pack
-from rmis_calib.solver.model.normal_equations import accumulate
+from rmis_calib.solver.model.normal_equations import WeightedModel, accumulate
 from rmis_calib.solver.model.parameters import NuisancePriors, initial_state, make_layout
 from rmis_calib.solver.settings import UnknownSettings
 
@@ -76,14 +76,14 @@ def study(
     clean = Problem.from_arrays(exact).only(*kinds).cameras(cameras)
     X = torch.as_tensor(truth["camera_right_T_arm"])
     solver = SolverSettings(unknowns=unknowns)
-    packed = pack(clean, solver.noise)
+    measured = pack(clean, solver.noise)
     state = replace(
         initial_state(NuisancePriors.of(clean), X[:, :3, :3], X[:, :3, 3]),
         end_offset=torch.full_like(X[:, 0, 0], truth["shaft_end_offset_mm"]),
     )
-    layout = make_layout(NuisancePriors.of(clean), packed, state, unknowns, solver.noise)
+    layout = make_layout(NuisancePriors.of(clean), measured, state, unknowns, solver.noise)
     noise, _ = assumed_noise(clean, solver.noise)
-    information = accumulate(packed, state, layout, noise, solver.chunk).H
+    information = accumulate(WeightedModel(measured, layout, noise, chunk=solver.chunk), state).H
     return Study(problem, X, torch.linalg.inv(information)[:, :6, :6])
 
 

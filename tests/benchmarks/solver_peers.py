@@ -133,10 +133,10 @@ class AnalyticPeer:
     """`marginalised` with this package's residuals and Jacobian; unknowns are increments of the start."""
 
     def __init__(self, problem: Problem, settings: SolverSettings, start: torch.Tensor, end_offset: float) -> None:
-        self.packed = pack(problem, settings.noise)
+        self.measured = pack(problem, settings.noise)
         nominal = NuisancePriors.of(problem)
         zero = initial_state(nominal, start[None, :3, :3], start[None, :3, 3])
-        self.layout = make_layout(nominal, self.packed, zero, settings.unknowns, settings.noise)
+        self.layout = make_layout(nominal, self.measured, zero, settings.unknowns, settings.noise)
         self.origin = replace(zero, end_offset=torch.full((1,), end_offset, dtype=torch.float64))
         self.noise, _ = assumed_noise(problem, settings.noise)
 
@@ -146,8 +146,8 @@ class AnalyticPeer:
     def _jacobian(self, x: np.ndarray) -> torch.Tensor:
         """(n, k, p) in the increments from the start: the columns hold for increments from the current state."""
         state, delta = self._state(x), torch.as_tensor(x)
-        rows, shaft = linearise(self.packed, state)
-        J = columns(self.layout, rows, shaft, self.packed, state)[:, :, 0].permute(2, 0, 1).clone()
+        rows, shaft = linearise(self.measured, state)
+        J = columns(self.layout, rows, shaft, self.measured, state)[:, :, 0].permute(2, 0, 1).clone()
         for name, sign in (("rotation", 1.0), ("stereo_rotation", -1.0)):
             part = self.layout.blocks[name]
             K = sign * skew(delta[part])
@@ -163,15 +163,15 @@ class AnalyticPeer:
         sigma = self.layout.sigma[0, bounded].numpy()
         prior_J = np.eye(self.layout.size)[bounded.numpy()] / sigma[:, None]
         for _ in range(rounds):
-            rows, _ = linearise(self.packed, self._state(x))
+            rows, _ = linearise(self.measured, self._state(x))
             k, _, n = rows.r.shape
             S = torch.empty(k, k, 1, n, dtype=torch.float64)
-            covariance(rows.w, rows.a, image_variance(self.packed, self.noise), self.packed.cameras, self.noise, S)
+            covariance(rows.w, rows.a, image_variance(self.measured, self.noise), self.measured.cameras, self.noise, S)
             whiten = torch.linalg.inv(torch.linalg.cholesky(S[:, :, 0].permute(2, 0, 1)))
 
             def residuals(x: np.ndarray, whiten: torch.Tensor = whiten) -> np.ndarray:
                 state = self._state(x)
-                white = (whiten @ residual_rows(self.packed, state)[:, 0].T[..., None]).ravel()
+                white = (whiten @ residual_rows(self.measured, state)[:, 0].T[..., None]).ravel()
                 deviation = self.layout.prior(state)[0][0, bounded].numpy()
                 return np.concatenate((white.numpy(), deviation / sigma))
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from rmis_calib.geometry.rigid import rigid_from_rotation_translation
 from rmis_calib.geometry.rotations import matrix_to_rotvec
 from rmis_calib.solver.assess.observability import assess, detect_degeneracies
-from rmis_calib.solver.estimate.map_estimate import JointFit
+from rmis_calib.solver.estimate.map_estimate import MapEstimate
 from rmis_calib.solver.estimate.multistart import cheirality
 from rmis_calib.solver.estimate.noise_levels import COMPONENTS, assumed_noise
 from rmis_calib.solver.estimate.outliers import REJECTED
@@ -39,16 +39,16 @@ def two_step_solution(
     """Solution of `paper` and `global`, which use the axis lines alone."""
     axis_only = flat.only("axis")
     covariance = covariance + _unseen_depth(flat, R, t)
-    packed = pack(axis_only, settings.noise)
+    measured = pack(axis_only, settings.noise)
     noise, _ = assumed_noise(flat, settings.noise)
     state = initial_state(NuisancePriors.of(axis_only), R, t)
-    front = cheirality(packed, state, torch.ones_like(packed.line_ok[0]))
+    front = cheirality(measured, state, torch.ones_like(measured.line_ok[0]))
     status = torch.where(front < MIN_CHEIRALITY, SolveStatus.BEHIND_CAMERA, SolveStatus.CONVERGED)
     status = torch.where(
         torch.isfinite(covariance).all(-1).all(-1) & torch.isfinite(t).all(-1), status, SolveStatus.NON_FINITE
     )
-    seen = packed.line_ok.any(0).any(0)
-    excess = _chi2_per_dof(packed, state, noise)
+    seen = measured.line_ok.any(0).any(0)
+    excess = _chi2_per_dof(measured, state, noise)
     status = torch.where((excess > MAX_CHI2_PER_DOF) & (status == SolveStatus.CONVERGED), SolveStatus.MISFIT, status)
     observability = _observability(axis_only, R, t, covariance, noise, (False, False, False), settings)
     static = (observability.degeneracy & Degeneracy.STATIC_LAPAROSCOPE) > 0
@@ -57,7 +57,7 @@ def two_step_solution(
     observability = replace(
         observability, verdict=torch.where(static, observability.verdict.clamp_min(1), observability.verdict)
     )
-    shown = _residuals(packed, state)
+    shown = _residuals(measured, state)
     return Solution(
         method=method,
         camera_right_T_arm=rigid_from_rotation_translation(R, t),
@@ -79,10 +79,10 @@ def two_step_solution(
     )
 
 
-def _chi2_per_dof(packed: MeasurementRows, state: State, noise: NoiseModel) -> Float[Tensor, " b"]:
+def _chi2_per_dof(measured: MeasurementRows, state: State, noise: NoiseModel) -> Float[Tensor, " b"]:
     """Weighted squared residuals over degrees of freedom, on a few hundred motions: a fit in the wrong basin shows
     here where the cheirality does not."""
-    part = packed.narrow(slice(None), slice(None, None, max(1, packed.motions // CHECKED_MOTIONS)))
+    part = measured.narrow(slice(None), slice(None, None, max(1, measured.motions // CHECKED_MOTIONS)))
     return motion_distance2(part, state, noise).sum(-1) / (part.rows_ok.sum((0, 2)) - 6.0).clamp_min(1.0)
 
 
@@ -97,18 +97,18 @@ def _unseen_depth(flat: Problem, R: Tensor, t: Tensor) -> Float[Tensor, "b 6 6"]
     return torch.nn.functional.pad(torch.where(unseen[:, None, None], block, 0.0), (3, 0, 3, 0))
 
 
-def joint_solution(fit: JointFit, settings: SolverSettings, alternative: AlternativeModel | None = None) -> Solution:
+def joint_solution(fit: MapEstimate, settings: SolverSettings, alternative: AlternativeModel | None = None) -> Solution:
     """Solution of the joint estimate; its covariance allows for the alternative model."""
-    packed, state = fit.packed, fit.state
+    measured, state = fit.model.measured, fit.state
     C = fit.covariance[:, :6, :6]
     status, reason, excess = _judge(fit)
     C = C * excess.clamp_min(1.0)[:, None, None]  # too small noise levels would make sigma too small (Birge 1932)
     if alternative is not None:
         C = _mixed(C, state.R, state.t, alternative)
-    distance = (fit.distance2 / packed.rows_ok.sum(0).clamp_min(1)).sqrt()
-    uses = (packed.has_contours, packed.has_ends, packed.has_heads)
-    left = rigid_from_rotation_translation(state.stereo_R, state.stereo_t) if packed.cameras == 2 else None
-    shown = _residuals(packed, state)
+    distance = (fit.distance2 / measured.rows_ok.sum(0).clamp_min(1)).sqrt()
+    uses = (measured.has_contours, measured.has_ends, measured.has_heads)
+    left = rigid_from_rotation_translation(state.stereo_R, state.stereo_t) if measured.cameras == 2 else None
+    shown = _residuals(measured, state)
     return Solution(
         method="joint",
         camera_right_T_arm=rigid_from_rotation_translation(state.R, state.t),
@@ -118,13 +118,13 @@ def joint_solution(fit: JointFit, settings: SolverSettings, alternative: Alterna
         cheirality=fit.cheirality,
         iterations=fit.steps,
         chi2_per_dof=excess,
-        distance=torch.where(packed.rows_ok.any(0), distance, torch.nan),
+        distance=torch.where(measured.rows_ok.any(0), distance, torch.nan),
         reason=reason,
-        noise={name: getattr(fit.noise, name).sqrt() for name in COMPONENTS},
+        noise={name: getattr(fit.model.noise, name).sqrt() for name in COMPONENTS},
         nuisances=_nuisances(fit, settings),
         bias=fit.bias[:, :6],
         history=fit.history,
-        observability=_observability(fit.problem, state.R, state.t, C, fit.noise, uses, settings),
+        observability=_observability(fit.problem, state.R, state.t, C, fit.model.noise, uses, settings),
         posterior=_posterior(fit, excess.clamp_min(1.0)),
         residual_lines=shown.lines,
         residual_ends=shown.ends,
@@ -143,24 +143,24 @@ def _mixed(
     return (1.0 - weight) * C + weight * (alternative.covariance.reshape(-1, 6, 6) + gap[:, :, None] * gap[:, None])
 
 
-def _posterior(fit: JointFit, excess: Float[Tensor, " b"]) -> Posterior:
+def _posterior(fit: MapEstimate, excess: Float[Tensor, " b"]) -> Posterior:
     """The fit with all variances `excess` times as large."""
-    noise = NoiseModel(**{name: value * excess for name, value in vars(fit.noise).items()})
-    return Posterior(fit.state, fit.layout, noise, fit.information / excess[:, None, None])
+    noise = NoiseModel(**{name: value * excess for name, value in vars(fit.model.noise).items()})
+    return Posterior(fit.state, fit.model.layout, noise, fit.information / excess[:, None, None])
 
 
-def _judge(fit: JointFit) -> tuple[Int[Tensor, " b"], Int[Tensor, "b n"], Float[Tensor, " b"]]:
+def _judge(fit: MapEstimate) -> tuple[Int[Tensor, " b"], Int[Tensor, "b n"], Float[Tensor, " b"]]:
     """Status, what became of each motion, and chi^2 per degree of freedom."""
-    packed, used = fit.packed, fit.weight > REJECTED
-    cameras = torch.tensor(packed.row_camera, device=used.device)
-    measured = torch.stack([packed.rows_ok[cameras == c].any(0) for c in range(packed.cameras)])
+    rows, used = fit.model.measured, fit.weight > REJECTED
+    cameras = torch.tensor(rows.row_camera, device=used.device)
+    measured = torch.stack([rows.rows_ok[cameras == c].any(0) for c in range(rows.cameras)])
     good = (used & measured).any(0)
     reason = torch.where(good, MotionReason.USED, MotionReason.OUTLIER)
     reason = torch.where(good & (measured & ~used).any(0), MotionReason.OUTLIER_ONE_CAMERA, reason)
     reason = torch.where(measured.any(0), reason, MotionReason.NOT_MEASURED)
     # By camera: with swapped videos one camera alone fits perfectly, and the other one not at all.
     kept = torch.where(measured.any(-1), (used & measured).sum(-1) / measured.sum(-1).clamp_min(1), 1.0).amin(0)
-    excess = fit.chi2 / (packed.keep(used).rows_ok.sum((0, 2)) - 6.0).clamp_min(1.0)
+    excess = fit.chi2 / (rows.keep(used).rows_ok.sum((0, 2)) - 6.0).clamp_min(1.0)
     status = fit.status
     for wrong, code in (
         (fit.cheirality < MIN_CHEIRALITY, SolveStatus.BEHIND_CAMERA),
@@ -171,24 +171,24 @@ def _judge(fit: JointFit) -> tuple[Int[Tensor, " b"], Int[Tensor, "b n"], Float[
     return status, reason, excess
 
 
-def _nuisances(fit: JointFit, settings: SolverSettings) -> dict[str, Nuisance]:
+def _nuisances(fit: MapEstimate, settings: SolverSettings) -> dict[str, Nuisance]:
     """Every estimated unknown beside the transform."""
-    deviation, _ = fit.layout.prior(fit.state)
+    deviation, _ = fit.model.layout.prior(fit.state)
     sigma = fit.covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
     out = {}
-    for name, part in fit.layout.blocks.items():
+    for name, part in fit.model.layout.blocks.items():
         if name in ("rotation", "translation"):
             continue
         value = fit.state.radius[:, None] if name == "radius" else deviation[:, part]
-        held = sigma[:, part] > settings.unknowns.held_ratio * fit.layout.sigma[:, part]
+        held = sigma[:, part] > settings.unknowns.held_ratio * fit.model.layout.sigma[:, part]
         out[name] = Nuisance(
             value=value,
             sigma=sigma[:, part],
             unit=UNITS[name],
             held=held,
-            pull=deviation[:, part] / fit.layout.sigma[:, part],
+            pull=deviation[:, part] / fit.model.layout.sigma[:, part],
             log_odds_nominal=_log_odds_nominal(
-                deviation[:, part], fit.covariance[:, part, part], fit.layout.sigma[:, part]
+                deviation[:, part], fit.covariance[:, part, part], fit.model.layout.sigma[:, part]
             ),
         )
     return out
@@ -238,21 +238,21 @@ class _Residuals:
     heads: Float[Tensor, "b c n"]
 
 
-def _residuals(packed: MeasurementRows, state: State) -> _Residuals:
+def _residuals(measured: MeasurementRows, state: State) -> _Residuals:
     """Residuals of all motions, a long recording in parts."""
-    step = max(1, 8 * SHOWN_MOTIONS // packed.trials)
+    step = max(1, 8 * SHOWN_MOTIONS // measured.trials)
     parts = [
-        _residuals_of(packed.narrow(slice(None), slice(n, n + step)), state) for n in range(0, packed.motions, step)
+        _residuals_of(measured.narrow(slice(None), slice(n, n + step)), state) for n in range(0, measured.motions, step)
     ]
     return _Residuals(*(torch.cat([part[i] for part in parts], dim=-1) for i in range(3)))
 
 
-def _residuals_of(packed: MeasurementRows, state: State) -> list[Float[Tensor, "b c n"]]:
+def _residuals_of(measured: MeasurementRows, state: State) -> list[Float[Tensor, "b c n"]]:
     """Lines, ends and heads of motions that fit into memory at once; rows take turns between the cameras."""
-    squares, ok, c = residual_rows(packed, state).square_(), packed.rows_ok, packed.cameras
+    squares, ok, c = residual_rows(measured, state).square_(), measured.rows_ok, measured.cameras
     out, start = [], 0
     for kind in (LINE, END, HEAD):
-        part = slice(start, start + packed.row_kind.count(kind))
+        part = slice(start, start + measured.row_kind.count(kind))
         total, count = (x[part].unflatten(0, (-1, c)).sum(0) for x in (squares, ok))
         out.append(torch.where(count > 0, (total / count.clamp_min(1)).sqrt(), torch.nan).transpose(0, 1))
         start = part.stop

@@ -4,10 +4,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from rmis_calib.solver.model.batched_linalg import eliminate
-from rmis_calib.solver.model.measurement_rows import MeasurementRows
-from rmis_calib.solver.model.normal_equations import NoiseModel, covariance, image_variance
-from rmis_calib.solver.model.parameters import ParameterLayout, columns
+from rmis_calib.solver.model.batched_linalg import eliminate, rescaled, unit_diagonal
+from rmis_calib.solver.model.normal_equations import WeightedModel, covariance, image_variance
+from rmis_calib.solver.model.parameters import columns
 from rmis_calib.solver.model.residuals import State, linearise
 
 THINNING_ROUNDS = 16
@@ -16,15 +15,15 @@ LEAST_SCALED = 1e-13
 """Least eigenvalue of the information, scaled to a unit diagonal, that is more than rounding."""
 
 
-def motion_information(
-    packed: MeasurementRows, state: State, layout: ParameterLayout, noise: NoiseModel
-) -> Float[Tensor, "b n p p"]:
-    """Information J^T S^-1 J of each motion on its own."""
-    rows, shaft = linearise(packed, state)
-    k, b, n = rows.r.shape
-    system = torch.empty((k, k + layout.size, b, n), dtype=rows.r.dtype, device=rows.r.device)
-    covariance(rows.w, rows.a, image_variance(packed, noise), packed.cameras, noise, system[:, :k])
-    system[:, k:] = columns(layout, rows, shaft, packed, state)
+def motion_information(model: WeightedModel, state: State) -> Float[Tensor, "b n p p"]:
+    """Information J^T S^-1 J of each motion on its own; weights do not count."""
+    measured, layout = model.measured, model.layout
+    linear, shaft = linearise(measured, state)
+    k, b, n = linear.r.shape
+    system = torch.empty((k, k + layout.size, b, n), dtype=linear.r.dtype, device=linear.r.device)
+    image = image_variance(measured, model.noise)
+    covariance(linear.w, linear.a, image, measured.cameras, model.noise, system[:, :k])
+    system[:, k:] = columns(layout, linear, shaft, measured, state)
     eliminate(system)
     white = system[:, k:] * system.diagonal(dim1=0, dim2=1).permute(2, 0, 1).rsqrt()[:, None]
     return torch.einsum("kpbn,kqbn->bnpq", white, white)
@@ -32,10 +31,9 @@ def motion_information(
 
 def inverse(information: Float[Tensor, "*b p p"]) -> Float[Tensor, "*b p p"]:
     """Covariance of all unknowns; huge in directions without information."""
-    scale = information.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
-    values, vectors = torch.linalg.eigh(information * scale[..., :, None] * scale[..., None, :])
-    scaled = vectors @ (vectors / values.clamp_min(LEAST_SCALED)[..., None, :]).mT
-    return scaled * scale[..., :, None] * scale[..., None, :]
+    scaled, scale = unit_diagonal(information)
+    values, vectors = torch.linalg.eigh(scaled)
+    return rescaled(vectors @ (vectors / values.clamp_min(LEAST_SCALED)[..., None, :]).mT, scale)
 
 
 def select_d_optimal(
@@ -44,9 +42,9 @@ def select_d_optimal(
     """Indices of `count` motions that keep most of det(information) (D-optimal, greedy in rounds), and the part kept:
     the geometric mean over the six parameters of the transform of how much of the information is left."""
     n, p = information.shape[:2]
-    scale = (information.sum(0) + prior).diagonal().clamp_min(1e-300).rsqrt()
-    flat = (information * scale[:, None] * scale).flatten(1)
-    base = prior * scale[:, None] * scale
+    _, scale = unit_diagonal(information.sum(0) + prior)
+    flat = rescaled(information, scale).flatten(1)
+    base = rescaled(prior, scale)
     ridge = 1e-6 * torch.eye(p, dtype=flat.dtype, device=flat.device)
     chosen = torch.zeros(n, dtype=torch.bool, device=flat.device)
     for round_ in range(THINNING_ROUNDS):

@@ -17,6 +17,7 @@ from torch import Tensor
 from rmis_calib.solver.assess.information import inverse, motion_information
 from rmis_calib.solver.assess.observability import working_point_jacobian
 from rmis_calib.solver.model.measurement_rows import MeasurementRows, pack
+from rmis_calib.solver.model.normal_equations import WeightedModel
 from rmis_calib.solver.model.residuals import Shaft, State, predict_shaft
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import SolverSettings
@@ -109,8 +110,8 @@ def advise(
     each, seen = [], []
     for n in range(0, candidates.n_motions, settings.chunk):
         part = candidates.select_motions(slice(n, n + settings.chunk))
-        packed, visible = _predicted(pack(part, settings.noise), state, view, settings.advice.nearest_mm)
-        each.append(motion_information(packed, state, posterior.layout, posterior.noise)[0])
+        measured, visible = _predicted(pack(part, settings.noise), state, view, settings.advice.nearest_mm)
+        each.append(motion_information(WeightedModel(measured, posterior.layout, posterior.noise), state)[0])
         seen.append(visible)
     gain, visible = torch.cat(each), torch.cat(seen)
     chosen, path = [], [now]
@@ -152,27 +153,27 @@ def _least_effort(before: Tensor, trace: Float[Tensor, " m"], effort: Int[Tensor
 
 
 def _predicted(
-    packed: MeasurementRows, state: State, view: Float[Tensor, "c 4"], nearest_mm: float
+    measured: MeasurementRows, state: State, view: Float[Tensor, "c 4"], nearest_mm: float
 ) -> tuple[MeasurementRows, Bool[Tensor, " m"]]:
     """The candidates with noise-free measurements of what each camera would see, and which ones some camera sees."""
-    shaft = predict_shaft(packed, state)
+    shaft = predict_shaft(measured, state)
     part = torch.linspace(0.0, 1.0, ALONG_SAMPLES, dtype=shaft.D.dtype, device=shaft.D.device)
-    s_end = (packed.s_end + state.end_offset[:, None]).clamp_min(SHORTEST_VISIBLE_MM)
+    s_end = (measured.s_end + state.end_offset[:, None]).clamp_min(SHORTEST_VISIBLE_MM)
     s = part[:, None, None, None] * s_end
     xy, inside, depth = _in_view(shaft.p[:, None] + s * shaft.d[:, None], view)  # samples, c, b, n
     near = (inside & (depth < nearest_mm)).any(0)
     first = torch.where(inside, s, torch.inf).amin(0)
     last = torch.where(inside, s, -torch.inf).amax(0)
     seen = (last - first > SHORTEST_VISIBLE_MM) & ~near
-    points = _contact_points(packed, state, shaft, torch.where(seen, first, 0.0), torch.where(seen, last, 0.0))
-    changed: dict[str, Tensor] = {"line_xy": points, "line_ok": seen & packed.line_ok}
-    if packed.has_ends:
-        changed |= {"end_xy": xy[:, -1], "end_ok": inside[-1] & seen & packed.end_ok}
-    if packed.has_heads:
+    points = _contact_points(measured, state, shaft, torch.where(seen, first, 0.0), torch.where(seen, last, 0.0))
+    changed: dict[str, Tensor] = {"line_xy": points, "line_ok": seen & measured.line_ok}
+    if measured.has_ends:
+        changed |= {"end_xy": xy[:, -1], "end_ok": inside[-1] & seen & measured.end_ok}
+    if measured.has_heads:
         head_xy, head_inside, _ = _in_view(shaft.p + shaft.head, view)
-        changed |= {"head_xy": head_xy, "head_ok": head_inside & ~near & packed.head_ok}
-    packed = replace(packed, **changed)
-    return packed, packed.rows_ok.any(0)[0] & ~near.any(0)[0]
+        changed |= {"head_xy": head_xy, "head_ok": head_inside & ~near & measured.head_ok}
+    measured = replace(measured, **changed)
+    return measured, measured.rows_ok.any(0)[0] & ~near.any(0)[0]
 
 
 def _in_view(q: Float[Tensor, "3 *s c b n"], view: Float[Tensor, "c 4"]) -> tuple[Tensor, Tensor, Tensor]:
@@ -184,13 +185,13 @@ def _in_view(q: Float[Tensor, "3 *s c b n"], view: Float[Tensor, "c 4"]) -> tupl
 
 
 def _contact_points(
-    packed: MeasurementRows, state: State, shaft: Shaft, first: Tensor, last: Tensor
+    measured: MeasurementRows, state: State, shaft: Shaft, first: Tensor, last: Tensor
 ) -> Float[Tensor, "..."]:
     """Two points of each line row pair: where the contours, or the axis, are seen at these places along the axis."""
     lines = []
     for point, along in enumerate((first, last)):
         axis = shaft.p + along * shaft.d
-        rho = packed.line_rho[point::2]
+        rho = measured.line_rho[point::2]
         sine = (rho * state.radius[:, None] / shaft.D).clamp(-0.99, 0.99)
         n = (1.0 - sine.square()).sqrt() * shaft.m[:, None] + sine * shaft.u[:, None]
         contact = axis[:, None] - (n * axis[:, None]).sum(0) * n

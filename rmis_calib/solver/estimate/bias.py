@@ -24,8 +24,7 @@ from torch import Tensor
 
 from rmis_calib.solver.model.batched_linalg import cross, dot, unit
 from rmis_calib.solver.model.measurement_rows import LINE, MeasurementRows
-from rmis_calib.solver.model.normal_equations import NoiseModel, image_variance, normal_equations
-from rmis_calib.solver.model.parameters import ParameterLayout
+from rmis_calib.solver.model.normal_equations import NoiseModel, WeightedModel, image_variance, normal_equations
 from rmis_calib.solver.model.residuals import Shaft, State, _line_geometry, predict_shaft
 
 SIMULATED_PART = 16
@@ -51,100 +50,80 @@ def _turned(v: Tensor, phi: Tensor) -> Tensor:
 class _Draws:
     """Standard normal draws of one simulation, and the same with the other sign: trials of twice as many."""
 
-    def __init__(self, packed: MeasurementRows, generator: torch.Generator) -> None:
-        c, b, n = packed.cameras, packed.trials, packed.motions
+    def __init__(self, measured: MeasurementRows, generator: torch.Generator) -> None:
+        c, b, n = measured.cameras, measured.trials, measured.motions
 
         def draw(*shape: int) -> Tensor:
-            one = torch.randn(*shape, b, n, generator=generator, dtype=packed.p.dtype, device=packed.p.device)
+            one = torch.randn(*shape, b, n, generator=generator, dtype=measured.p.dtype, device=measured.p.device)
             return torch.cat((one, -one), dim=-2)
 
         self.turn, self.shift = draw(3), draw(3)
         self.camera_turn, self.camera_shift = draw(3, c), draw(3, c)
-        self.line = draw(*packed.line_rho.shape[:2])
-        self.end = draw(2, packed.end_xy.shape[1])
-        self.head = draw(2, packed.head_xy.shape[1])
+        self.line = draw(*measured.line_rho.shape[:2])
+        self.end = draw(2, measured.end_xy.shape[1])
+        self.head = draw(2, measured.head_xy.shape[1])
 
 
-def simulate(packed: MeasurementRows, state: State, noise: NoiseModel, draws: "_Draws") -> MeasurementRows:
+def simulate(measured: MeasurementRows, state: State, noise: NoiseModel, draws: "_Draws") -> MeasurementRows:
     """The measurements that the state and the measured kinematics predict, with noise of the model and these draws
     added."""
 
     def scaled(variance: Tensor, draw: Tensor) -> Tensor:
         return variance.sqrt()[:, None] * draw
 
-    shaft = predict_shaft(packed, state)
+    shaft = predict_shaft(measured, state)
     phi = scaled(noise.camera_rad, draws.camera_turn)
     p = shaft.p + scaled(noise.camera_mm, draws.camera_shift)
     d = unit(_turned(shaft.d, phi))
     M = cross(p, d)
     D = dot(M, M).sqrt()
     seen = Shaft(p=p, d=d, m=M / D, u=cross(d, M / D), D=D, s0=dot(p, d), head=_turned(shaft.head, phi))
-    predicted = _line_geometry(packed, state, seen)
-    sigma = image_variance(packed, noise).sqrt()
-    lines = packed.row_kind.count(LINE)
+    predicted = _line_geometry(measured, state, seen)
+    sigma = image_variance(measured, noise).sqrt()
+    lines = measured.row_kind.count(LINE)
     off = sigma[:lines].view_as(predicted.f) * draws.line - predicted.f
-    line_xy = torch.addcmul(packed.line_xy, predicted.n_image, off)
+    line_xy = torch.addcmul(measured.line_xy, predicted.n_image, off)
     turn = scaled(noise.kinematics_rad, draws.turn)
     simulated = replace(
-        packed,
-        p=packed.p + scaled(noise.kinematics_mm, draws.shift),
-        v=unit(_turned(packed.v, turn)),
-        head=_turned(packed.head, turn),
+        measured,
+        p=measured.p + scaled(noise.kinematics_mm, draws.shift),
+        v=unit(_turned(measured.v, turn)),
+        head=_turned(measured.head, turn),
         line_xy=line_xy,
     )
-    ends = packed.end_xy.shape[1]
-    if packed.has_ends:
-        q = seen.p + (packed.s_end + state.end_offset[:, None]) * seen.d
+    ends = measured.end_xy.shape[1]
+    if measured.has_ends:
+        q = seen.p + (measured.s_end + state.end_offset[:, None]) * seen.d
         simulated = replace(simulated, end_xy=q[:2] / q[2] + sigma[lines : lines + ends] * draws.end)
-    if packed.has_heads:
+    if measured.has_heads:
         q = seen.p + seen.head
         simulated = replace(simulated, head_xy=q[:2] / q[2] + sigma[lines + ends :].view_as(draws.head) * draws.head)
     return simulated
 
 
-def expected_score(
-    packed: MeasurementRows,
-    state: State,
-    layout: ParameterLayout,
-    noise: NoiseModel,
-    simulated_motions: int,
-    chunk: int,
-    seed: int,
-    weight: Float[Tensor, "c b n"] | None = None,
-) -> ScoreBias:
+def expected_score(model: WeightedModel, state: State, simulated_motions: int, seed: int) -> ScoreBias:
     """E[g] and E[H] at the state, from at least `simulated_motions` antithetic pairs (or one motion in SIMULATED_PART
-    where that is more).
-
-    Args:
-        weight: of each camera's measurements of a motion (outliers near 0 do not take part).
+    where that is more). Motions of weight near 0 (outliers) do not take part.
     """
-    generator = torch.Generator(device=packed.p.device).manual_seed(seed)
-    n, b = packed.motions, packed.trials
+    like = model.measured.p
+    generator = torch.Generator(device=like.device).manual_seed(seed)
+    n, b, p = model.measured.motions, model.measured.trials, model.layout.size
     wanted = max(simulated_motions, n // SIMULATED_PART)
     repeats = max(1, -(-wanted // n))
-    picked, picked_weight = packed, weight
+    picked = model
     if wanted < n:
-        order = torch.randperm(n, generator=generator, device=packed.p.device)[:wanted]
-        picked, picked_weight = packed.take_motions(order), None if weight is None else weight[..., order]
-    m = picked.motions
-    step_n, step_b = min(m, chunk), max(1, chunk // min(m, chunk))
-    g, H = (
-        torch.zeros_like(layout.sigma),
-        torch.zeros(b, layout.size, layout.size, dtype=packed.p.dtype, device=packed.p.device),
-    )
-    for b0 in range(0, b, step_b):
-        bs = slice(b0, min(b0 + step_b, b))
-        twice = torch.arange(bs.stop - bs.start, device=packed.p.device).repeat(2)
-        s, lay, nm = state.take(bs).take(twice), layout.take(bs).take(twice), noise.take(bs).take(twice)
-        for n0 in range(0, m, step_n):
-            ns = slice(n0, min(n0 + step_n, m))
-            part = picked.narrow(bs, ns)
+        picked = model.take_motions(torch.randperm(n, generator=generator, device=like.device)[:wanted])
+    g, H = torch.zeros_like(model.layout.sigma), torch.zeros(b, p, p, dtype=like.dtype, device=like.device)
+    for trials, along in picked.parts():
+        twice = torch.arange(trials.stop - trials.start, device=like.device).repeat(2)
+        at = state.take(trials).take(twice)
+        for motions in along:
+            part = picked.narrow(trials, motions)
             both = part.take_trials(twice)
-            both_weight = None if picked_weight is None else picked_weight[:, bs, ns].index_select(1, twice)
             for _ in range(repeats):
-                simulated = simulate(both, s, nm, _Draws(part, generator))
-                normal = normal_equations(simulated, s, lay, nm, both_weight)
-                g[bs] += normal.g.unflatten(0, (2, -1)).sum(0)
-                H[bs] += normal.H.unflatten(0, (2, -1)).sum(0)
-    scale = n / (m * repeats * 2.0)
+                simulated = simulate(both.measured, at, both.noise, _Draws(part.measured, generator))
+                normal = normal_equations(replace(both, measured=simulated), at)
+                g[trials] += normal.g.unflatten(0, (2, -1)).sum(0)
+                H[trials] += normal.H.unflatten(0, (2, -1)).sum(0)
+    scale = n / (picked.measured.motions * repeats * 2.0)
     return ScoreBias(g * scale, H * scale)

@@ -11,10 +11,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from rmis_calib.solver.model.measurement_rows import MeasurementRows
+from rmis_calib.solver.model.batched_linalg import unit_diagonal
 from rmis_calib.solver.model.normal_equations import (
-    NoiseModel,
     Normal,
+    WeightedModel,
     accumulate,
     frozen_chi2,
     normal_equations,
@@ -54,8 +54,7 @@ def solve_system(
 
     The step is zero where the system is not positive definite, and `solvable` says so.
     """
-    scale = H.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
-    scaled = H * scale[..., :, None] * scale[..., None, :]
+    scaled, scale = unit_diagonal(H)
     if damping is not None:
         scaled = scaled + torch.diag_embed(damping[:, None].expand_as(scale))
     identity = torch.eye(H.shape[-1], dtype=H.dtype, device=H.device)
@@ -66,25 +65,17 @@ def solve_system(
     return torch.where(solvable[:, None], step, 0.0), solvable
 
 
-def levenberg_marquardt(
-    packed: MeasurementRows,
-    state: State,
-    layout: ParameterLayout,
-    noise: NoiseModel,
-    tolerance: float,
-    max_iterations: int,
-    weight: Tensor | None = None,
-) -> Refined:
+def levenberg_marquardt(model: WeightedModel, state: State, tolerance: float, max_iterations: int) -> Refined:
     """Minimises r^T S^-1 r + priors with S held at each accepted iterate; a step counts only if this frozen cost falls.
 
     Converged when the undamped step d has d^T H d < tolerance^2: smaller than that part of the standard error in
     every direction.
     """
-    b, device = state.t.shape[0], state.t.device
+    layout, b, device = model.layout, state.t.shape[0], state.t.device
     damping = torch.full((b,), INITIAL_DAMPING, dtype=state.t.dtype, device=device)
     status = torch.full((b,), SolveStatus.MAX_ITERATIONS, dtype=torch.int64, device=device)
     steps, running = torch.zeros_like(status), torch.ones_like(status, dtype=torch.bool)
-    normal = with_prior(normal_equations(packed, state, layout, noise, weight, keep=True), layout, state)
+    normal = with_prior(normal_equations(model, state, keep=True), layout, state)
     history = [normal.chi2]
     for _ in range(max_iterations):
         newton, solvable = solve_system(normal.H, normal.g)
@@ -98,7 +89,7 @@ def levenberg_marquardt(
         delta, possible = solve_system(normal.H, normal.g, damping)
         proposal = state.moved(layout.step(delta))
         deviation, prior_weight = layout.prior(proposal)
-        chi2 = frozen_chi2(normal.kept_factor, residual_rows(packed, proposal)).sum(-1) + (
+        chi2 = frozen_chi2(normal.kept_factor, residual_rows(model.measured, proposal)).sum(-1) + (
             prior_weight * deviation.square()
         ).sum(-1)
         predicted = -(delta * normal.g).sum(-1)
@@ -111,21 +102,12 @@ def levenberg_marquardt(
         steps = steps + accepted
         if bool(accepted.any()):
             state = proposal.where(accepted, state)
-            normal = with_prior(normal_equations(packed, state, layout, noise, weight, keep=True), layout, state)
+            normal = with_prior(normal_equations(model, state, keep=True), layout, state)
             history.append(normal.chi2)
     return Refined(state, normal, status, steps, tuple(history))
 
 
-def gauss_newton(
-    packed: MeasurementRows,
-    state: State,
-    layout: ParameterLayout,
-    noise: NoiseModel,
-    tolerance: float,
-    max_passes: int,
-    chunk: int,
-    weight: Tensor | None = None,
-) -> Refined:
+def gauss_newton(model: WeightedModel, state: State, tolerance: float, max_passes: int) -> Refined:
     """Gauss-Newton passes over all motions, streaming, from a start within a few standard errors.
 
     A step is kept if the next pass finds the Newton decrement g^T H^-1 g smaller; else it is undone and a quarter of
@@ -137,7 +119,7 @@ def gauss_newton(
     steps = torch.zeros_like(status)
 
     def evaluate(at: State) -> tuple[Normal, Tensor, Tensor, Tensor]:
-        normal = accumulate(packed, at, layout, noise, chunk, weight)
+        normal = accumulate(model, at)
         delta, solvable = solve_system(normal.H, normal.g)
         return normal, delta, solvable, -(delta * normal.g).sum(-1)
 
@@ -153,11 +135,11 @@ def gauss_newton(
         running = running & solvable & ~bad & ~done
         last = running & (decrement.square() < (PREDICTION_MARGIN * tolerance) ** 2 * previous)
         if bool(last.any()):
-            state, normal = _settled(state, normal, layout, delta, last)
+            state, normal = _settled(state, normal, model.layout, delta, last)
             status, steps, running = torch.where(last, SolveStatus.CONVERGED, status), steps + last, running & ~last
         if not bool(running.any()):
             break
-        proposal = state.moved(layout.step(torch.where(running[:, None], delta, 0.0)))
+        proposal = state.moved(model.layout.step(torch.where(running[:, None], delta, 0.0)))
         new_normal, new_delta, new_solvable, new_decrement = evaluate(proposal)
         better = running & new_solvable & (new_decrement < decrement)
         state = proposal.where(better, state)

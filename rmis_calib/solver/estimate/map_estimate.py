@@ -14,9 +14,10 @@ from rmis_calib.solver.estimate.multistart import any_free, cheirality, multista
 from rmis_calib.solver.estimate.noise_levels import assumed_noise, estimate_components
 from rmis_calib.solver.estimate.one_step_update import one_step_update
 from rmis_calib.solver.estimate.outliers import REJECTED, anneal, classify
+from rmis_calib.solver.model.batched_linalg import rescaled, unit_diagonal
 from rmis_calib.solver.model.measurement_rows import MeasurementRows, pack
-from rmis_calib.solver.model.normal_equations import NoiseModel, with_prior
-from rmis_calib.solver.model.parameters import NuisancePriors, ParameterLayout, initial_state, make_layout
+from rmis_calib.solver.model.normal_equations import NoiseModel, WeightedModel, with_prior
+from rmis_calib.solver.model.parameters import NuisancePriors, initial_state, make_layout
 from rmis_calib.solver.model.residuals import State
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import SolverSettings
@@ -39,19 +40,29 @@ accepts."""
 
 
 @dataclass(frozen=True)
-class JointFit:
-    """Estimate of a flat batch, before it is put into words."""
+class MapEstimate:
+    """Estimate of a flat batch, before it is put into words.
+
+    Attributes:
+        problem: what was solved.
+        model: measurements, parameters, noise levels and weights (1, or nearly 0 for what was rejected).
+        state: every unknown.
+        covariance, information: of every parameter, priors included.
+        chi2, rows: weighted squared residuals with priors, and the number of measured rows.
+        distance2: r^T S^-1 r of each motion.
+        status, steps: of the refinement.
+        cheirality: part of the measurements that lie in front of their camera, with the tip on the imaged side.
+        bias: what was subtracted from every parameter.
+        history: cost of accepted iterates.
+    """
 
     problem: Problem
-    packed: MeasurementRows
+    model: WeightedModel
     state: State
-    layout: ParameterLayout
-    noise: NoiseModel
     covariance: Float[Tensor, "b p p"]
     information: Float[Tensor, "b p p"]
     chi2: Float[Tensor, " b"]
     rows: Float[Tensor, " b"]
-    weight: Float[Tensor, "c b n"]
     distance2: Float[Tensor, "b n"]
     status: Int[Tensor, " b"]
     steps: Int[Tensor, " b"]
@@ -59,9 +70,16 @@ class JointFit:
     bias: Float[Tensor, "b p"]
     history: tuple[Tensor, ...]
 
+    @property
+    def weight(self) -> Float[Tensor, "c b n"]:
+        """Of each camera's measurements of a motion."""
+        measured = self.model.measured
+        everything = torch.ones_like(measured.line_ok[0], dtype=measured.p.dtype)
+        return everything if self.model.weight is None else self.model.weight
 
-def solve_joint(problem: Problem, settings: SolverSettings, start: "JointFit | None" = None) -> JointFit:
-    """Joint estimate of a problem with one trial axis.
+
+def map_estimate(problem: Problem, settings: SolverSettings, start: "MapEstimate | None" = None) -> MapEstimate:
+    """Joint estimate of a problem with one trial axis: the maximum of the posterior of all unknowns.
 
     Args:
         problem: motions and measurements.
@@ -71,36 +89,35 @@ def solve_joint(problem: Problem, settings: SolverSettings, start: "JointFit | N
     Raises:
         InsufficientDataError: fewer measured rows than unknowns in some trial.
     """
-    packed = pack(problem, settings.noise)
+    measured = pack(problem, settings.noise)
     assumed, free = assumed_noise(problem, settings.noise)
     generator = torch.Generator().manual_seed(settings.seed)
-    order = torch.randperm(packed.motions, generator=generator).to(packed.p.device)
-    long = packed.trials == 1 and packed.motions > LONG and start is None
-    if long:
-        first = solve_joint(problem.select_motions(order[:LONG_SAMPLE]), replace(settings, bias_correction=False))
-        state, noise, layout = first.state, first.noise, first.layout
-        refined, weight = one_step_update(packed, state, layout, noise, settings, first.covariance)
+    order = torch.randperm(measured.motions, generator=generator).to(measured.p.device)
+    if measured.trials == 1 and measured.motions > LONG and start is None:
+        first = map_estimate(problem.select_motions(order[:LONG_SAMPLE]), replace(settings, bias_correction=False))
+        model = replace(first.model, measured=measured, weight=None)
+        refined, weight = one_step_update(model, first.state, settings, first.covariance)
         if refined is not None:
-            return _finish(problem, packed, refined, layout, noise, weight, settings)
+            return _finish(problem, replace(model, weight=weight), refined, settings)
     if start is None:
-        state, noise, contaminated = multistart(problem, packed, order, assumed, free, settings)
+        state, noise, contaminated = multistart(problem, measured, order, assumed, free, settings)
     else:
-        state, noise, contaminated = start.state, start.noise, bool((start.weight < REJECTED).any())
+        state, noise, contaminated = start.state, start.model.noise, bool((start.weight < REJECTED).any())
     nominal = NuisancePriors.of(problem)
     fresh = initial_state(nominal, state.R, state.t)
-    layout = make_layout(nominal, packed, fresh, settings.unknowns, settings.noise)
+    layout = make_layout(nominal, measured, fresh, settings.unknowns, settings.noise)
+    model = WeightedModel(measured, layout, noise, chunk=settings.chunk)
     state = fresh if start is not None else state
-    _check_rows(packed)
-    state, noise = _settle_noise(packed, state, layout, noise, order, contaminated, assumed, free, settings)
-    refined, weight = _refine_all(packed, state, layout, noise, contaminated or settings.robust == "on", settings)
-    return _finish(problem, packed, refined, layout, noise, weight, settings)
+    _check_rows(measured)
+    state, noise = _settle_noise(model, state, order, contaminated, assumed, free, settings)
+    model = replace(model, noise=noise)
+    refined, weight = _refine_all(model, state, contaminated or settings.robust == "on", settings)
+    return _finish(problem, replace(model, weight=weight), refined, settings)
 
 
 def _settle_noise(
-    packed: MeasurementRows,
+    model: WeightedModel,
     state: State,
-    layout: ParameterLayout,
-    noise: NoiseModel,
     order: Tensor,
     contaminated: bool,
     assumed: NoiseModel,
@@ -108,86 +125,66 @@ def _settle_noise(
     settings: SolverSettings,
 ) -> tuple[State, NoiseModel]:
     """Outliers annealed away and noise levels estimated on a sample."""
-    sample = packed.take_motions(order[:SAMPLE_MOTIONS]) if packed.motions > SAMPLE_MOTIONS else packed
+    sample = model.take_motions(order[:SAMPLE_MOTIONS]) if model.measured.motions > SAMPLE_MOTIONS else model
     if contaminated:
-        state, _ = anneal(sample, state, layout, noise, settings.outlier_probability)
+        state, _ = anneal(sample, state, settings.outlier_probability)
     for _ in range(NOISE_ROUNDS if any_free(free) else 0):
-        weight = classify(sample, state, noise, settings.outlier_probability, settings.chunk) if contaminated else None
-        noise = estimate_components(sample, state, layout, noise, assumed, free, settings.noise, weight)
-        state = gauss_newton(sample, state, layout, noise, 0.1, 4, settings.chunk, weight).state
-    return state, noise
+        weight = classify(sample, state, settings.outlier_probability) if contaminated else None
+        sample = replace(sample, weight=weight)
+        sample = replace(sample, noise=estimate_components(sample, state, assumed, free, settings.noise))
+        state = gauss_newton(sample, state, 0.1, 4).state
+    return state, sample.noise
 
 
 def _refine_all(
-    packed: MeasurementRows,
-    state: State,
-    layout: ParameterLayout,
-    noise: NoiseModel,
-    contaminated: bool,
-    settings: SolverSettings,
+    model: WeightedModel, state: State, contaminated: bool, settings: SolverSettings
 ) -> tuple[Refined, Float[Tensor, "c b n"] | None]:
     """Estimate from all motions, and the weights where something was rejected."""
-    probability, chunk = settings.outlier_probability, settings.chunk
-    weight = classify(packed, state, noise, probability, chunk) if contaminated else None
-    refined = gauss_newton(packed, state, layout, noise, settings.tolerance_sigma, MAX_PASSES, chunk, weight)
+    probability, tolerance = settings.outlier_probability, settings.tolerance_sigma
+    weight = classify(model, state, probability) if contaminated else None
+    refined = gauss_newton(replace(model, weight=weight), state, tolerance, MAX_PASSES)
     if settings.robust == "off":
         return refined, None
     suspicious = refined.normal.distance2 if weight is None else None
-    again = classify(packed, refined.state, noise, probability, chunk, suspicious)
+    again = classify(model, refined.state, probability, suspicious)
     changed = bool((again < REJECTED).any()) if weight is None else not torch.equal(again, weight)
     if changed:
         weight = again
-        refined = gauss_newton(
-            packed, refined.state, layout, noise, settings.tolerance_sigma, MAX_PASSES, chunk, weight
-        )
+        refined = gauss_newton(replace(model, weight=weight), refined.state, tolerance, MAX_PASSES)
     return refined, weight
 
 
-def _finish(
-    problem: Problem,
-    packed: MeasurementRows,
-    refined: Refined,
-    layout: ParameterLayout,
-    noise: NoiseModel,
-    weight: Float[Tensor, "c b n"] | None,
-    settings: SolverSettings,
-) -> JointFit:
+def _finish(problem: Problem, model: WeightedModel, refined: Refined, settings: SolverSettings) -> MapEstimate:
     """Bias correction, covariance, and what every motion contributed."""
     state, normal = refined.state, refined.normal
     bias = torch.zeros_like(normal.g)
     information = normal.H
     if settings.bias_correction:
-        expected = expected_score(
-            packed, state, layout, noise, settings.bias_motions, settings.chunk, settings.seed, weight
-        )
-        prior = with_prior(replace(normal, H=torch.zeros_like(normal.H)), layout, state).H
+        expected = expected_score(model, state, settings.bias_motions, settings.seed)
+        prior = with_prior(replace(normal, H=torch.zeros_like(normal.H)), model.layout, state).H
         delta = _seen_step(normal.H, prior, normal.g - expected.g)
-        state, bias = state.moved(layout.step(delta)), -delta
+        state, bias = state.moved(model.layout.step(delta)), -delta
         information = floored_information(normal.H - prior, expected.H, prior) + prior
-    sample = slice(None, None, max(1, packed.motions // LONG_SAMPLE))
-    weight_all = torch.ones_like(packed.line_ok[0], dtype=packed.p.dtype) if weight is None else weight
-    scale = information.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
-    scaled = torch.nan_to_num(information * scale[:, :, None] * scale[:, None], posinf=0.0, neginf=0.0)
-    inverse = torch.linalg.pinv(scaled, hermitian=True, rtol=1e-15)
-    covariance = inverse * scale[:, :, None] * scale[:, None]
-    return JointFit(
+    scaled, scale = unit_diagonal(information)
+    scaled = torch.nan_to_num(scaled, posinf=0.0, neginf=0.0)
+    fit = MapEstimate(
         problem=problem,
-        packed=packed,
+        model=model,
         state=state,
-        layout=layout,
-        noise=noise,
-        covariance=covariance,
+        covariance=rescaled(torch.linalg.pinv(scaled, hermitian=True, rtol=1e-15), scale),
         information=information,
         chi2=normal.chi2,
         rows=normal.rows,
-        weight=weight_all,
         distance2=normal.distance2,
         status=refined.status,
         steps=refined.steps,
-        cheirality=cheirality(packed.narrow(slice(None), sample), state, weight_all[..., sample] > REJECTED),
+        cheirality=torch.empty(0),
         bias=bias,
         history=refined.history,
     )
+    sample = slice(None, None, max(1, model.measured.motions // LONG_SAMPLE))
+    shown = model.measured.narrow(slice(None), sample)
+    return replace(fit, cheirality=cheirality(shown, state, fit.weight[..., sample] > REJECTED))
 
 
 def _seen_step(
@@ -195,10 +192,9 @@ def _seen_step(
 ) -> Float[Tensor, "b p"]:
     """-H^-1 g without the directions in which the data add nothing to the prior: there a simulated score is
     rounding."""
-    scale = H.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
-    both = scale[:, :, None] * scale[:, None]
-    values, vectors = torch.linalg.eigh(torch.nan_to_num(H * both))
-    from_prior = ((vectors.mT @ (prior * both)) * vectors.mT).sum(-1)
+    scaled, scale = unit_diagonal(H)
+    values, vectors = torch.linalg.eigh(torch.nan_to_num(scaled))
+    from_prior = ((vectors.mT @ rescaled(prior, scale)) * vectors.mT).sum(-1)
     along = (vectors.mT @ (torch.nan_to_num(g) * scale)[..., None])[..., 0]
     along = torch.where(from_prior < MOSTLY_PRIOR * values, along / values, 0.0)
     return -scale * (vectors @ along[..., None])[..., 0]
@@ -216,23 +212,22 @@ def floored_information(
         expected: E[H] of the data.
         prior: sets the scale of an unknown of which the data know nothing, where H is rounding.
     """
-    scale = (H + prior).diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
-    unit = H * scale[:, :, None] * scale[:, None]
-    values, vectors = torch.linalg.eigh(torch.nan_to_num(unit))
+    _, scale = unit_diagonal(H + prior)
+    values, vectors = torch.linalg.eigh(torch.nan_to_num(rescaled(H, scale)))
     root = vectors * values.clamp_min(1e-14).rsqrt()[:, None] @ vectors.mT
-    excess = root @ ((expected - H) * scale[:, :, None] * scale[:, None]) @ root
+    excess = root @ rescaled(expected - H, scale) @ root
     part, turn = torch.linalg.eigh(torch.nan_to_num(0.5 * (excess + excess.mT)))
     kept = (1.0 - part).clamp(INFORMATION_FLOOR, 1.0 / INFORMATION_FLOOR)
     half = vectors * values.clamp_min(0.0).sqrt()[:, None] @ vectors.mT
     corrected = half @ (turn * kept[:, None] @ turn.mT) @ half
-    return corrected / (scale[:, :, None] * scale[:, None])
+    return rescaled(corrected, scale.reciprocal())
 
 
-def _check_rows(packed: MeasurementRows) -> None:
-    measured = packed.rows_ok.sum((0, 2))
-    if bool((measured < 6).any()):
+def _check_rows(measured: MeasurementRows) -> None:
+    count = measured.rows_ok.sum((0, 2))
+    if bool((count < 6).any()):
         raise InsufficientDataError(
             where="measurements",
             expected="at least 6 measured rows (3 lines or head points)",
-            found=int(measured.min()),
+            found=int(count.min()),
         )

@@ -10,7 +10,7 @@ from torch import Tensor
 from rmis_calib.solver.estimate.gauss_newton import levenberg_marquardt
 from rmis_calib.solver.estimate.outliers import anneal, chi2_quantile, truncated_cost
 from rmis_calib.solver.model.measurement_rows import MeasurementRows
-from rmis_calib.solver.model.normal_equations import NoiseModel, camera_distance2
+from rmis_calib.solver.model.normal_equations import NoiseModel, WeightedModel, camera_distance2
 from rmis_calib.solver.model.parameters import NuisancePriors, initial_state, make_layout
 from rmis_calib.solver.model.residuals import State, predict_shaft
 from rmis_calib.solver.problem import Problem
@@ -33,28 +33,28 @@ SURE_RAD = 0.02
 """...if its own sample fixes the rotation this well (1.1 degrees)."""
 
 
-def cheirality(packed: MeasurementRows, state: State, used: Bool[Tensor, "c b n"]) -> Float[Tensor, " b"]:
+def cheirality(measured: MeasurementRows, state: State, used: Bool[Tensor, "c b n"]) -> Float[Tensor, " b"]:
     """Part of the used lines with the visible shaft in front of the camera and running to the tip as in the picture;
     used head points, and ends where no line was measured, count when they are in front."""
-    shaft = predict_shaft(packed, state)
-    x0, y0 = packed.line_xy[:, 0]
-    x1, y1 = packed.line_xy[:, 1]
+    shaft = predict_shaft(measured, state)
+    x0, y0 = measured.line_xy[:, 0]
+    x1, y1 = measured.line_xy[:, 1]
     turn = (y0 - y1) * shaft.m[0] + (x1 - x0) * shaft.m[1] + (x0 * y1 - y0 * x1) * shaft.m[2]
     depth = (x0 + x1) * shaft.u[0] + (y0 + y1) * shaft.u[1] + 2.0 * shaft.u[2]
-    ok = packed.line_ok[0] & used
+    ok = measured.line_ok[0] & used
     kinds = [((turn > 0) & (depth > 0), ok)]
-    if packed.has_heads:
-        kinds.append((shaft.p[2] + shaft.head[2] > 0, packed.head_ok & used))
-    if packed.has_ends and not bool(packed.line_ok.any()):
-        s_end = packed.s_end + state.end_offset[:, None]
-        kinds.append((shaft.p[2] + s_end * shaft.d[2] > 0, packed.end_ok & used))
+    if measured.has_heads:
+        kinds.append((shaft.p[2] + shaft.head[2] > 0, measured.head_ok & used))
+    if measured.has_ends and not bool(measured.line_ok.any()):
+        s_end = measured.s_end + state.end_offset[:, None]
+        kinds.append((shaft.p[2] + s_end * shaft.d[2] > 0, measured.end_ok & used))
     good = torch.stack([(front & ok).sum((0, 2)) for front, ok in kinds]).sum(0)
     return good / torch.stack([ok.sum((0, 2)) for _, ok in kinds]).sum(0).clamp_min(1)
 
 
 def multistart(
     problem: Problem,
-    packed: MeasurementRows,
+    measured: MeasurementRows,
     order: Tensor,
     assumed: NoiseModel,
     free: dict[str, Tensor],
@@ -63,8 +63,8 @@ def multistart(
     """The best start after a short refinement on a sample, noise inflated to what it explains, and whether there are
     outliers."""
     index = order[: settings.start_motions]
-    sample = packed.take_motions(index)
-    starts = None if packed.has_contours else _starts(problem, packed, settings)
+    sample = measured.take_motions(index)
+    starts = None if measured.has_contours else _starts(problem, measured, settings)
     if starts is None:  # a closed form from the sample; the search over all motions only where it does not settle
         R, t = contour_starts(sample, torch.nan_to_num(problem.radius_mm), all_kinds=False)
     else:
@@ -72,7 +72,7 @@ def multistart(
     first = _race(problem, sample, R, t, assumed, free, settings, robust=False)
     if first.settled:
         return first.state, first.noise, False
-    R, t = _starts(problem, packed, settings) if starts is None else starts
+    R, t = _starts(problem, measured, settings) if starts is None else starts
     race = _race(problem, sample, R, t, assumed, free, settings, robust=False)
     state, noise = race.state, race.noise
     # A poor fit hides outliers where the noise levels are to be estimated: they are raised until it looks good.
@@ -80,13 +80,13 @@ def multistart(
     if settings.robust == "off" or not suspect:
         return state, noise, False
     index = order[: ROBUST_SAMPLES * settings.start_motions]
-    sample = packed.take_motions(index)
+    sample = measured.take_motions(index)
     candidates = robust_candidates(problem.select_motions(index), settings.grid, COMPETING_MINIMA)
     starts_R, starts_t = [state.R[:, None], candidates.R], [state.t[:, None], candidates.t]
-    if packed.has_contours:
+    if measured.has_contours:
         R, t = contour_starts(sample, torch.nan_to_num(problem.radius_mm), reweightings=10)
         starts_R, starts_t = [*starts_R, R], [*starts_t, t]
-    if _points_matter(packed):
+    if _points_matter(measured):
         R, t = point_starts(sample, settings.grid, COMPETING_MINIMA, reweightings=4)
         starts_R, starts_t = [*starts_R, R], [*starts_t, t]
     race = _race(problem, sample, torch.cat(starts_R, 1), torch.cat(starts_t, 1), assumed, free, settings, robust=True)
@@ -105,25 +105,25 @@ class _Multistart:
 
 
 def _starts(
-    problem: Problem, packed: MeasurementRows, settings: SolverSettings
+    problem: Problem, measured: MeasurementRows, settings: SolverSettings
 ) -> tuple[Float[Tensor, "b s 3 3"], Float[Tensor, "b s 3"]]:
     """Minima of the axis planes, and starts from contours and ends."""
     candidates = find_candidates(LineStatistics.from_problem(problem), settings.grid, settings.minima)
     chosen = candidates.order()[:, :COMPETING_MINIMA]
     rows = torch.arange(chosen.shape[0], device=chosen.device)[:, None]
     R, t = candidates.R[rows, chosen], candidates.t[rows, chosen]
-    if packed.has_contours:
-        more_R, more_t = contour_starts(packed, torch.nan_to_num(problem.radius_mm))
+    if measured.has_contours:
+        more_R, more_t = contour_starts(measured, torch.nan_to_num(problem.radius_mm))
         R, t = torch.cat((R, more_R), dim=1), torch.cat((t, more_t), dim=1)
-    if _points_matter(packed):
-        more_R, more_t = point_starts(packed, settings.grid, COMPETING_MINIMA)
+    if _points_matter(measured):
+        more_R, more_t = point_starts(measured, settings.grid, COMPETING_MINIMA)
         R, t = torch.cat((more_R, R), dim=1), torch.cat((more_t, t), dim=1)
     return R, t
 
 
-def _points_matter(packed: MeasurementRows) -> bool:
+def _points_matter(measured: MeasurementRows) -> bool:
     """Whether to start from points: head points always, the shaft's ends where contours do not tell their places."""
-    return packed.has_heads or (packed.has_ends and not packed.has_contours)
+    return measured.has_heads or (measured.has_ends and not measured.has_contours)
 
 
 def _race(
@@ -149,11 +149,12 @@ def _race(
         narrowed = nominal.repeat(part, s)
         state = initial_state(narrowed, R[part].flatten(0, 1), t[part].flatten(0, 1))
         layout = make_layout(narrowed, many, state, settings.unknowns, settings.noise)
+        model = WeightedModel(many, layout, noise, chunk=settings.chunk)
         if robust:
-            state, weight = anneal(many, state, layout, noise, settings.outlier_probability, steps=12)
-            refined = levenberg_marquardt(many, state, layout, noise, START_TOLERANCE, 3, weight)
+            state, weight = anneal(model, state, settings.outlier_probability, steps=12)
+            refined = levenberg_marquardt(replace(model, weight=weight), state, START_TOLERANCE, 3)
         else:
-            refined = levenberg_marquardt(many, state, layout, noise, START_TOLERANCE, START_ITERATIONS)
+            refined = levenberg_marquardt(model, state, START_TOLERANCE, START_ITERATIONS)
         distance2, rows = camera_distance2(many, refined.state, noise, refined.normal.linear)
         cost = truncated_cost(distance2, rows, settings.outlier_probability if robust else 1e-12)
         front = cheirality(many, refined.state, torch.ones_like(distance2, dtype=torch.bool)).view(-1, s)

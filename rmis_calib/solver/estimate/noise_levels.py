@@ -19,10 +19,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rmis_calib.solver.model.batched_linalg import rescaled, unit_diagonal
 from rmis_calib.solver.model.measurement_rows import END, HEAD, LINE, MeasurementRows
-from rmis_calib.solver.model.normal_equations import NoiseModel, covariance, image_variance
+from rmis_calib.solver.model.normal_equations import NoiseModel, WeightedModel, covariance, image_variance
 from rmis_calib.solver.model.parameters import ParameterLayout, columns
-from rmis_calib.solver.model.residuals import Rows, State, linearise
+from rmis_calib.solver.model.residuals import LinearisedRows, State, linearise
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import NoiseSettings
 
@@ -63,34 +64,29 @@ def assumed_noise(problem: Problem, settings: NoiseSettings) -> tuple[NoiseModel
 
 
 def estimate_components(
-    packed: MeasurementRows,
-    state: State,
-    layout: ParameterLayout,
-    noise: NoiseModel,
-    assumed: NoiseModel,
-    free: dict[str, Tensor],
-    settings: NoiseSettings,
-    weight: Float[Tensor, "c b n"] | None = None,
+    model: WeightedModel, state: State, assumed: NoiseModel, free: dict[str, Tensor], settings: NoiseSettings
 ) -> NoiseModel:
     """Components after a few scoring steps at this state. Motions and cameras of weight below 1/2 do not take part.
 
     Args:
-        packed: as many motions as fit at once; a thousand fix every component to a few per cent.
+        model: of as many motions as fit at once; a thousand fix every component to a few per cent. Its noise levels are
+            where the steps set out from.
     """
+    measured, layout, noise = model.measured, model.layout, model.noise
     if not any(bool(value.any()) for value in free.values()):
         return noise
-    if weight is not None:
-        packed = packed.keep(weight > 0.5)
-    rows, shaft = linearise(packed, state)
-    J = columns(layout, rows, shaft, packed, state).permute(2, 3, 0, 1)  # (b, n, k, p)
-    r = rows.r.permute(1, 2, 0)[..., None]
-    parts = _component_matrices(packed, rows)
+    if model.weight is not None:
+        measured = measured.keep(model.weight > 0.5)
+    linear, shaft = linearise(measured, state)
+    J = columns(layout, linear, shaft, measured, state).permute(2, 3, 0, 1)  # (b, n, k, p)
+    r = linear.r.permute(1, 2, 0)[..., None]
+    parts = _component_matrices(measured, linear)
     centre = torch.stack([getattr(assumed, name) for name in COMPONENTS], dim=-1).clamp_min(1e-30).log()
-    free_mask = torch.stack([free[name] for name in COMPONENTS], dim=-1) & _present(packed)
+    free_mask = torch.stack([free[name] for name in COMPONENTS], dim=-1) & _present(measured)
     prior = (2.0 * math.log(settings.prior_factor)) ** -2
     for _ in range(SCORING_STEPS):
         theta = torch.stack([getattr(noise, name) for name in COMPONENTS], dim=-1).clamp_min(1e-30).log()
-        score, fisher = _score(packed, rows, J, r, noise, parts, layout)
+        score, fisher = _score(measured, linear, J, r, noise, parts, layout)
         v = theta.exp()
         score = v * score - prior * (theta - centre)
         fisher = v[:, :, None] * v[:, None] * fisher + prior * torch.eye(
@@ -108,26 +104,26 @@ def estimate_components(
     return noise
 
 
-def _present(packed: MeasurementRows) -> Tensor:
+def _present(measured: MeasurementRows) -> Tensor:
     """Which components act on any measured row, (5,)."""
-    kinds = torch.tensor(packed.row_kind, device=packed.p.device)
-    seen = packed.rows_ok.flatten(1).any(1)
+    kinds = torch.tensor(measured.row_kind, device=measured.p.device)
+    seen = measured.rows_ok.flatten(1).any(1)
     present = [bool((seen & (kinds == kind)).any()) for kind in (LINE, END, HEAD)]
-    return torch.tensor([*present, True, True], device=packed.p.device)
+    return torch.tensor([*present, True, True], device=measured.p.device)
 
 
-def _component_matrices(packed: MeasurementRows, rows: Rows) -> tuple[list[Tensor], Tensor]:
+def _component_matrices(measured: MeasurementRows, linear: LinearisedRows) -> tuple[list[Tensor], Tensor]:
     """Diagonals of the image components (b, n, k) each, and the two kinematic matrices (2, b, n, k, k)."""
-    kinds = torch.tensor(packed.row_kind, device=rows.r.device)[:, None, None]
-    nominal = torch.where(packed.rows_ok, packed.rows_var, 0.0)
+    kinds = torch.tensor(measured.row_kind, device=linear.r.device)[:, None, None]
+    nominal = torch.where(measured.rows_ok, measured.rows_var, 0.0)
     diagonals = [torch.where(kinds == kind, nominal, 0.0).permute(1, 2, 0) for kind in (LINE, END, HEAD)]
-    vectors = torch.stack((rows.w, rows.a)).permute(0, 3, 4, 2, 1)  # (2, b, n, k, 3)
+    vectors = torch.stack((linear.w, linear.a)).permute(0, 3, 4, 2, 1)  # (2, b, n, k, 3)
     return diagonals, vectors @ vectors.mT
 
 
 def _score(
-    packed: MeasurementRows,
-    rows: Rows,
+    measured: MeasurementRows,
+    linear: LinearisedRows,
     J: Tensor,
     r: Tensor,
     noise: NoiseModel,
@@ -135,9 +131,9 @@ def _score(
     layout: ParameterLayout,
 ) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b m m"]]:
     """Score with respect to each variance, and the Fisher information."""
-    k, b, n = rows.r.shape
+    k, b, n = linear.r.shape
     S = torch.empty((k, k, b, n), dtype=r.dtype, device=r.device)
-    covariance(rows.w, rows.a, image_variance(packed, noise), packed.cameras, noise, S)
+    covariance(linear.w, linear.a, image_variance(measured, noise), measured.cameras, noise, S)
     inverse = _inverse(S.permute(2, 3, 0, 1))
     a, B = inverse @ r, inverse @ J
     H = (J.mT @ B).sum(1) + torch.diag_embed(layout.sigma.square().reciprocal())
@@ -162,8 +158,7 @@ def _inverse(matrix: Float[Tensor, "*batch m m"]) -> Float[Tensor, "*batch m m"]
     Such a motion, or such an unknown, then takes no part in the score. It happens where an estimate runs away along a
     direction that the data do not see.
     """
-    scale = matrix.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
-    unit = matrix * scale[..., :, None] * scale[..., None, :]
+    unit, scale = unit_diagonal(matrix)
     inverse, failed = torch.linalg.inv_ex(unit)
     usable = (failed == 0) & torch.isfinite(inverse).flatten(-2).all(-1)
-    return torch.where(usable[..., None, None], inverse * scale[..., :, None] * scale[..., None, :], 0.0)
+    return torch.where(usable[..., None, None], rescaled(inverse, scale), 0.0)

@@ -8,9 +8,7 @@ from torch import Tensor
 
 from rmis_calib.solver.estimate.gauss_newton import Refined, solve_system
 from rmis_calib.solver.estimate.outliers import REJECTED, classify
-from rmis_calib.solver.model.measurement_rows import MeasurementRows
-from rmis_calib.solver.model.normal_equations import NoiseModel, accumulate
-from rmis_calib.solver.model.parameters import ParameterLayout
+from rmis_calib.solver.model.normal_equations import WeightedModel, accumulate
 from rmis_calib.solver.model.residuals import State
 from rmis_calib.solver.settings import SolverSettings
 from rmis_calib.solver.status import SolveStatus
@@ -21,12 +19,7 @@ not speak for all motions."""
 
 
 def one_step_update(
-    packed: MeasurementRows,
-    state: State,
-    layout: ParameterLayout,
-    noise: NoiseModel,
-    settings: SolverSettings,
-    sample_covariance: Float[Tensor, "b p p"],
+    model: WeightedModel, state: State, settings: SolverSettings, sample_covariance: Float[Tensor, "b p p"]
 ) -> tuple[Refined | None, Float[Tensor, "c b n"] | None]:
     """One Gauss-Newton step of a long recording from the estimate of a large sample, outliers taken out of the same
     pass.
@@ -34,15 +27,15 @@ def one_step_update(
     The step is of the order of the sample's standard error e; what it leaves is of order e^2 over the scene's size
     (1e-3 e or less). Returns None where the step is larger than the sample allows.
     """
-    normal = accumulate(packed, state, layout, noise, settings.chunk)
+    normal = accumulate(model, state)
     weight = None
     if settings.robust != "off":
-        weight = classify(packed, state, noise, settings.outlier_probability, settings.chunk, normal.distance2)
+        weight = classify(model, state, settings.outlier_probability, normal.distance2)
         index = torch.nonzero((weight < REJECTED).any(0)[0])[:, 0]
         if len(index) > 0:
-            out = packed.take_motions(index)
-            with_all = accumulate(out, state, layout, noise, settings.chunk)
-            with_rest = accumulate(out, state, layout, noise, settings.chunk, weight[..., index])
+            out = model.take_motions(index)
+            with_all = accumulate(out, state)
+            with_rest = accumulate(replace(out, weight=weight[..., index]), state)
             changed = {
                 name: getattr(normal, name) - getattr(with_all, name) + getattr(with_rest, name)
                 for name in ("H", "g", "chi2")
@@ -55,4 +48,4 @@ def one_step_update(
         return None, None
     settled = replace(normal, g=torch.zeros_like(normal.g), chi2=normal.chi2 + (normal.g * delta).sum(-1))
     status = torch.full_like(sigma, SolveStatus.CONVERGED, dtype=torch.int64)
-    return Refined(state.moved(layout.step(delta)), settled, status, torch.ones_like(status)), weight
+    return Refined(state.moved(model.layout.step(delta)), settled, status, torch.ones_like(status)), weight

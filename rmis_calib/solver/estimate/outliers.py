@@ -11,6 +11,7 @@ A weight enters as covariance / w, so a dropped camera costs nothing and distort
 efficiency and covariance are those of the good measurements.
 """
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -21,8 +22,7 @@ from torch import Tensor
 
 from rmis_calib.solver.estimate.gauss_newton import solve_system
 from rmis_calib.solver.model.measurement_rows import MeasurementRows
-from rmis_calib.solver.model.normal_equations import NoiseModel, camera_distance2, normal_equations, with_prior
-from rmis_calib.solver.model.parameters import ParameterLayout
+from rmis_calib.solver.model.normal_equations import WeightedModel, camera_distance2, normal_equations, with_prior
 from rmis_calib.solver.model.residuals import State
 
 MIN_WEIGHT = 1e-6
@@ -59,15 +59,11 @@ def inlier_weight(distance2: Tensor, rows: Tensor, probability: float) -> Float[
 
 
 def anneal(
-    packed: MeasurementRows,
-    state: State,
-    layout: ParameterLayout,
-    noise: NoiseModel,
-    probability: float,
-    steps: int = ANNEALING_STEPS,
+    model: WeightedModel, state: State, probability: float, steps: int = ANNEALING_STEPS
 ) -> tuple[State, Float[Tensor, "c b n"]]:
     """State and weights after graduated non-convexity from this state; one Gauss-Newton step at each level."""
-    distance2, rows = camera_distance2(packed, state, noise)
+    measured, layout, noise = model.measured, model.layout, model.noise
+    distance2, rows = camera_distance2(measured, state, noise)
     limit = chi2_quantile(rows, probability)
     ratio = torch.where(rows > 0, distance2 / limit, 0.0).amax((0, 2))
     mu = 1.0 / (2.0 * ratio - 1.0).clamp_min(1e-3)
@@ -85,52 +81,44 @@ def anneal(
             mu = mu * factor
         else:
             weight = inlier_weight(distance2, rows, probability)
-        normal = with_prior(normal_equations(packed, state, layout, noise, weight), layout, state)
+        normal = with_prior(normal_equations(replace(model, weight=weight), state), layout, state)
         delta, _ = solve_system(normal.H, normal.g)
         state = state.moved(layout.step(delta))
-        distance2, rows = camera_distance2(packed, state, noise)
+        distance2, rows = camera_distance2(measured, state, noise)
     return state, inlier_weight(distance2, rows, probability)
 
 
 def classify(
-    packed: MeasurementRows,
-    state: State,
-    noise: NoiseModel,
-    probability: float,
-    chunk: int,
-    distance2: Float[Tensor, "b n"] | None = None,
+    model: WeightedModel, state: State, probability: float, distance2: Float[Tensor, "b n"] | None = None
 ) -> Float[Tensor, "c b n"]:
-    """`inlier_weight` of any number of motions, `chunk` at a time.
+    """`inlier_weight` of any number of motions, a chunk at a time. Weights that the model has do not count.
 
     Args:
         distance2: of each motion as a whole, where it is known: a camera's own distance is never larger, so only
             motions above the least threshold are looked at.
     """
+    measured, noise = model.measured, model.noise
     if distance2 is not None:
-        rows = torch.stack([packed.rows_ok[_rows_of(packed, c)].sum(0) for c in range(packed.cameras)])
+        rows = torch.stack([measured.rows_ok[_rows_of(measured, c)].sum(0) for c in range(measured.cameras)])
         limit = chi2_quantile(rows.to(distance2.dtype), probability)
         limit = torch.where(rows > 0, limit, torch.inf).amin(0)
         trial, motion = torch.nonzero(~(distance2 <= limit) & (rows.sum(0) > 0), as_tuple=True)
         weight = torch.ones_like(rows, dtype=distance2.dtype)
-        for k in range(0, len(trial), chunk):
-            b, n = trial[k : k + chunk], motion[k : k + chunk]
-            part = inlier_weight(*camera_distance2(packed.gather(b, n), state.take(b), noise.take(b)), probability)
+        for k in range(0, len(trial), model.chunk):
+            b, n = trial[k : k + model.chunk], motion[k : k + model.chunk]
+            part = inlier_weight(*camera_distance2(measured.gather(b, n), state.take(b), noise.take(b)), probability)
             weight[:, b, n] = part[:, :, 0]
         return weight
-    step_n = min(packed.motions, chunk)
-    step_b = max(1, chunk // step_n)
     weights = []
-    for b in range(0, packed.trials, step_b):
-        bs = slice(b, min(b + step_b, packed.trials))
+    for trials, along in model.parts():
+        at, own = state.take(trials), noise.take(trials)
         parts = [
-            inlier_weight(
-                *camera_distance2(packed.narrow(bs, slice(n, n + step_n)), state.take(bs), noise.take(bs)), probability
-            )
-            for n in range(0, packed.motions, step_n)
+            inlier_weight(*camera_distance2(measured.narrow(trials, motions), at, own), probability)
+            for motions in along
         ]
         weights.append(torch.cat(parts, dim=2))
     return torch.cat(weights, dim=1)
 
 
-def _rows_of(packed: MeasurementRows, camera: int) -> list[int]:
-    return [i for i, c in enumerate(packed.row_camera) if c == camera]
+def _rows_of(measured: MeasurementRows, camera: int) -> list[int]:
+    return [i for i, c in enumerate(measured.row_camera) if c == camera]

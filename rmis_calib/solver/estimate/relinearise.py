@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rmis_calib.solver.estimate.map_estimate import JointFit, solve_joint
+from rmis_calib.solver.estimate.map_estimate import MapEstimate, map_estimate
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import SolverSettings
 from rmis_calib.solver.start.candidates import find_candidates
@@ -47,21 +47,21 @@ def scan_clock(
     return float(offsets_s[score.argmin()]), score
 
 
-def solve_relinearised(problem: Problem, settings: SolverSettings, kinematics: Kinematics) -> JointFit:
+def solve_relinearised(problem: Problem, settings: SolverSettings, kinematics: Kinematics) -> MapEstimate:
     """Joint estimate with the kinematics evaluated anew at the estimated offsets, until they settle.
 
     Args:
         problem: one trial axis, at the offsets to start from (`joint_offset_at`, `clock_at`).
         kinematics: of the same trials.
     """
-    fit = solve_joint(problem, settings)
+    fit = map_estimate(problem, settings)
     for _ in range(ROUNDS - 1):
         if _settled(fit):
             break
         joint_at = _at(problem.joint_offset_at, fit.state.joint_offset)
         clock_at = _at(problem.clock_at, fit.state.clock)
         problem = kinematics(joint_at + fit.state.joint_offset, clock_at + fit.state.clock)
-        fit = solve_joint(problem, settings, fit)
+        fit = map_estimate(problem, settings, fit)
     return fit
 
 
@@ -69,12 +69,12 @@ def _at(value: Tensor | None, like: Tensor) -> Tensor:
     return torch.zeros_like(like) if value is None else value
 
 
-def _settled(fit: JointFit) -> bool:
+def _settled(fit: MapEstimate) -> bool:
     sigma = fit.covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
     for name in ("joint_offset", "clock"):
-        if name in fit.layout.blocks:
+        if name in fit.model.layout.blocks:
             moved = getattr(fit.state, name)
             moved = moved if moved.ndim == 2 else moved[:, None]
-            if bool((moved.abs() > SETTLED_SIGMA * sigma[:, fit.layout.blocks[name]]).any()):
+            if bool((moved.abs() > SETTLED_SIGMA * sigma[:, fit.model.layout.blocks[name]]).any()):
                 return False
     return True

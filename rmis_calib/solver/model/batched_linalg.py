@@ -67,6 +67,20 @@ def batch_last(x: Tensor, kept: int) -> Tensor:
     return x.permute(*range(x.ndim - kept, x.ndim), *range(x.ndim - kept)).contiguous()
 
 
+def unit_diagonal(matrix: Float[Tensor, "*b p p"]) -> tuple[Float[Tensor, "*b p p"], Float[Tensor, "*b p"]]:
+    """(S M S, the diagonal of S) with S = diag(M)^-1/2: radians and millimetres mix once the diagonal is one.
+
+    So M^-1 = S (S M S)^-1 S. A diagonal entry of zero, or below, is scaled as if it were 1e-300.
+    """
+    scale = matrix.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
+    return rescaled(matrix, scale), scale
+
+
+def rescaled(matrix: Float[Tensor, "*b p p"], scale: Float[Tensor, "*b p"]) -> Float[Tensor, "*b p p"]:
+    """S M S with S = diag(scale)."""
+    return matrix * scale[..., :, None] * scale[..., None, :]
+
+
 def eliminate(augmented: Float[Tensor, "k cols b n"]) -> Float[Tensor, "k cols b n"]:
     """LDL^T elimination, in place, of the symmetric positive definite systems in the first k columns.
 

@@ -8,6 +8,7 @@ eliminating xi from min |y - J xi|^2_D + |xi|^2_Sigma leaves y^T (D + J Sigma J^
 S is evaluated at the *predicted* rows of the current estimate and held while the score J^T S^-1 r is driven to zero.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -18,7 +19,7 @@ from rmis_calib.errors import InputError
 from rmis_calib.solver.model.batched_linalg import eliminate, forward_substitute
 from rmis_calib.solver.model.measurement_rows import END, HEAD, LINE, MeasurementRows
 from rmis_calib.solver.model.parameters import ParameterLayout, columns
-from rmis_calib.solver.model.residuals import Rows, State, linearise
+from rmis_calib.solver.model.residuals import LinearisedRows, State, linearise
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,60 @@ class NoiseModel:
 
 
 @dataclass(frozen=True)
+class WeightedModel:
+    """All that turns a state into normal equations: measurements of `b` trials, the parameters that explain them, and
+    the noise that weights them.
+
+    Attributes:
+        measured: the measurements.
+        layout: parameters and their priors.
+        noise: variances.
+        weight: in (0, 1], of each camera's measurements of a motion; None: all 1.
+        chunk: motions (times trials) that are in work at once: bounds memory.
+    """
+
+    measured: MeasurementRows
+    layout: ParameterLayout
+    noise: NoiseModel
+    weight: Float[Tensor, "c b n"] | None = None
+    chunk: int = 4096
+
+    def narrow(self, trials: slice, motions: slice) -> "WeightedModel":
+        """The part of these trials and motions."""
+        weight = None if self.weight is None else self.weight[:, trials, motions]
+        measured = self.measured.narrow(trials, motions)
+        return replace(
+            self, measured=measured, layout=self.layout.take(trials), noise=self.noise.take(trials), weight=weight
+        )
+
+    def take_motions(self, index: Tensor) -> "WeightedModel":
+        """The part of the motions `index`, the same for every trial."""
+        weight = None if self.weight is None else self.weight[..., index]
+        return replace(self, measured=self.measured.take_motions(index), weight=weight)
+
+    def take_trials(self, index: Tensor) -> "WeightedModel":
+        """The trials `index`, in this order, repeated where it repeats them."""
+        weight = None if self.weight is None else self.weight.index_select(1, index)
+        measured = self.measured.take_trials(index)
+        return replace(
+            self, measured=measured, layout=self.layout.take(index), noise=self.noise.take(index), weight=weight
+        )
+
+    def parts(self) -> Iterator[tuple[slice, list[slice]]]:
+        """Slices of trials, each with the slices of motions, that hold `chunk` motions or fewer."""
+        return chunks(self.measured.trials, self.measured.motions, self.chunk)
+
+
+def chunks(trials: int, motions: int, chunk: int) -> Iterator[tuple[slice, list[slice]]]:
+    """Slices of trials, each with the slices of motions, that hold `chunk` motions (times trials) or fewer."""
+    step_n = max(1, min(motions, chunk))
+    step_b = max(1, chunk // step_n)
+    along = [slice(n, min(n + step_n, motions)) for n in range(0, motions, step_n)]
+    for b in range(0, trials, step_b):
+        yield slice(b, min(b + step_b, trials)), along
+
+
+@dataclass(frozen=True)
 class Normal:
     """Normal equations of `b` trials, priors included.
 
@@ -60,7 +115,7 @@ class Normal:
     rows: Float[Tensor, " b"]
     distance2: Float[Tensor, "b n"]
     factor: Tensor | None = None
-    linear: Rows | None = None
+    linear: LinearisedRows | None = None
 
     @property
     def kept_factor(self) -> Tensor:
@@ -70,11 +125,11 @@ class Normal:
         return self.factor
 
 
-def image_variance(packed: MeasurementRows, noise: NoiseModel) -> Float[Tensor, "k b n"]:
+def image_variance(measured: MeasurementRows, noise: NoiseModel) -> Float[Tensor, "k b n"]:
     """D: nominal variances times the factor of each kind; 1 for rows that were not measured (they are zero)."""
     factors = {LINE: noise.line, END: noise.end, HEAD: noise.head}
-    scale = torch.stack([factors[kind] for kind in packed.row_kind])
-    return torch.where(packed.rows_ok, packed.rows_var * scale[:, :, None], 1.0)
+    scale = torch.stack([factors[kind] for kind in measured.row_kind])
+    return torch.where(measured.rows_ok, measured.rows_var * scale[:, :, None], 1.0)
 
 
 def covariance(
@@ -89,7 +144,7 @@ def covariance(
     """Writes S into `out`. With a weight per camera and motion, that camera's block is inflated by 1/weight.
 
     Args:
-        w, a: effects of a translation and a rotation of the shaft on each row (`residuals.Rows`).
+        w, a: effects of a translation and a rotation of the shaft on each row (`residuals.LinearisedRows`).
         image: D.
         cameras: number of cameras; rows take turns between them.
     """
@@ -123,27 +178,21 @@ def _add_gram(
             out.addcmul_(left, right)
 
 
-def normal_equations(
-    packed: MeasurementRows,
-    state: State,
-    layout: ParameterLayout,
-    noise: NoiseModel,
-    weight: Tensor | None = None,
-    keep: bool = False,
-) -> Normal:
-    """Normal equations of motions that fit into memory at once.
+def normal_equations(model: WeightedModel, state: State, keep: bool = False) -> Normal:
+    """Normal equations, without priors, of motions that fit into memory at once.
 
     Args:
-        weight: (c, b, n) in (0, 1] of each camera's measurements of a motion.
-        keep: also return the rows and the factor.
+        keep: also return the linearised rows and the factor.
     """
-    rows, shaft = linearise(packed, state)
-    k, b, n = rows.r.shape
+    measured, layout = model.measured, model.layout
+    linear, shaft = linearise(measured, state)
+    k, b, n = linear.r.shape
     p = layout.size
-    augmented = torch.empty((k, k + p + 1, b, n), dtype=rows.r.dtype, device=rows.r.device)
-    covariance(rows.w, rows.a, image_variance(packed, noise), packed.cameras, noise, augmented[:, :k], weight)
-    columns(layout, rows, shaft, packed, state, out=augmented[:, k:-1])
-    augmented[:, -1] = rows.r
+    augmented = torch.empty((k, k + p + 1, b, n), dtype=linear.r.dtype, device=linear.r.device)
+    image = image_variance(measured, model.noise)
+    covariance(linear.w, linear.a, image, measured.cameras, model.noise, augmented[:, :k], model.weight)
+    columns(layout, linear, shaft, measured, state, out=augmented[:, k:-1])
+    augmented[:, -1] = linear.r
     eliminate(augmented)
     pivots = augmented.diagonal(dim1=0, dim2=1).permute(2, 0, 1)  # (k, b, n)
     white = augmented[:, k:].mul_(pivots.rsqrt()[:, None])
@@ -152,10 +201,10 @@ def normal_equations(
         H=gram[:, :p, :p],
         g=gram[:, :p, p],
         chi2=gram[:, p, p],
-        rows=packed.rows_ok.sum((0, 2)).to(gram.dtype),
+        rows=measured.rows_ok.sum((0, 2)).to(gram.dtype),
         distance2=white[:, -1].square().sum(0),
         factor=augmented[:, :k] if keep else None,
-        linear=rows if keep else None,
+        linear=linear if keep else None,
     )
 
 
@@ -176,36 +225,20 @@ def with_prior(normal: Normal, layout: ParameterLayout, state: State) -> Normal:
     )
 
 
-def accumulate(
-    packed: MeasurementRows,
-    state: State,
-    layout: ParameterLayout,
-    noise: NoiseModel,
-    chunk: int,
-    weight: Tensor | None = None,
-) -> Normal:
-    """Normal equations with priors of any number of motions, `chunk` at a time: memory does not grow with N.
+def accumulate(model: WeightedModel, state: State) -> Normal:
+    """Normal equations with priors of any number of motions, a chunk at a time: memory does not grow with N.
 
     Motions stream: the sums over chunks are sums over machines just as well.
     """
-    trials, motions = packed.trials, packed.motions
-    step_n = min(motions, chunk)
-    step_b = max(1, chunk // step_n)
     per_trial = []
-    for b in range(0, trials, step_b):
-        bs = slice(b, min(b + step_b, trials))
-        part_state, part_layout, part_noise = state.take(bs), layout.take(bs), noise.take(bs)
-        parts = []
-        for n in range(0, motions, step_n):
-            ns = slice(n, min(n + step_n, motions))
-            part_weight = None if weight is None else weight[:, bs, ns]
-            parts.append(normal_equations(packed.narrow(bs, ns), part_state, part_layout, part_noise, part_weight))
-        per_trial.append(_joined(parts))
+    for trials, along in model.parts():
+        at = state.take(trials)
+        per_trial.append(_joined([normal_equations(model.narrow(trials, motions), at) for motions in along]))
     if len(per_trial) == 1:
-        return with_prior(per_trial[0], layout, state)
+        return with_prior(per_trial[0], model.layout, state)
     names = ("H", "g", "chi2", "rows", "distance2")
     joined = {name: torch.cat([getattr(part, name) for part in per_trial]) for name in names}
-    return with_prior(replace(per_trial[0], **joined), layout, state)
+    return with_prior(replace(per_trial[0], **joined), model.layout, state)
 
 
 def _joined(parts: list[Normal]) -> Normal:
@@ -216,31 +249,31 @@ def _joined(parts: list[Normal]) -> Normal:
     return replace(parts[0], **sums, distance2=torch.cat([part.distance2 for part in parts], dim=-1))
 
 
-def motion_distance2(packed: MeasurementRows, state: State, noise: NoiseModel) -> Float[Tensor, "b n"]:
+def motion_distance2(measured: MeasurementRows, state: State, noise: NoiseModel) -> Float[Tensor, "b n"]:
     """Mahalanobis distance^2 of all measurements of each motion."""
-    rows, _ = linearise(packed, state)
-    return _distance2(rows.w, rows.a, rows.r, image_variance(packed, noise), packed.cameras, noise)
+    linear, _ = linearise(measured, state)
+    return _distance2(linear.w, linear.a, linear.r, image_variance(measured, noise), measured.cameras, noise)
 
 
 def camera_distance2(
-    packed: MeasurementRows, state: State, noise: NoiseModel, rows: Rows | None = None
+    measured: MeasurementRows, state: State, noise: NoiseModel, linear: LinearisedRows | None = None
 ) -> tuple[Float[Tensor, "c b n"], Float[Tensor, "c b n"]]:
     """Mahalanobis distance^2 of each camera's measurements of a motion on their own, and how many rows they are.
 
     Args:
-        rows: linearised at this state, where they are known.
+        linear: rows linearised at this state, where they are known.
     """
-    rows = linearise(packed, state)[0] if rows is None else rows
-    c, b = packed.cameras, packed.trials
+    linear = linearise(measured, state)[0] if linear is None else linear
+    c, b = measured.cameras, measured.trials
 
     def apart(x: Tensor) -> Tensor:
         """(*, k c, b, n) -> (*, k, c b, n): cameras as trials of their own."""
         return x.unflatten(-3, (-1, c)).flatten(-3, -2)
 
     own = NoiseModel(**{name: value.repeat(c) for name, value in vars(noise).items()})
-    image = apart(image_variance(packed, noise))
-    distance2 = _distance2(apart(rows.w), apart(rows.a), apart(rows.r), image, 1, own)
-    return distance2.unflatten(0, (c, b)), apart(packed.rows_ok).sum(0).to(rows.r.dtype).unflatten(0, (c, b))
+    image = apart(image_variance(measured, noise))
+    distance2 = _distance2(apart(linear.w), apart(linear.a), apart(linear.r), image, 1, own)
+    return distance2.unflatten(0, (c, b)), apart(measured.rows_ok).sum(0).to(linear.r.dtype).unflatten(0, (c, b))
 
 
 def _distance2(

@@ -9,7 +9,7 @@ from torch import Tensor
 from rmis_calib.errors import InputError
 from rmis_calib.solver.model.batched_linalg import add_cross_, batch_last, dot, rotate
 from rmis_calib.solver.model.measurement_rows import LINE, MeasurementRows, line_points
-from rmis_calib.solver.model.residuals import Rows, Shaft, State, rcm_axes
+from rmis_calib.solver.model.residuals import LinearisedRows, Shaft, State, rcm_axes
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import NoiseSettings, UnknownSettings
 
@@ -143,7 +143,7 @@ def initial_state(nominal: NuisancePriors, R: Float[Tensor, "b 3 3"], t: Float[T
 
 
 def make_layout(
-    nominal: NuisancePriors, packed: MeasurementRows, origin: State, settings: UnknownSettings, noise: NoiseSettings
+    nominal: NuisancePriors, measured: MeasurementRows, origin: State, settings: UnknownSettings, noise: NoiseSettings
 ) -> ParameterLayout:
     """The parameters that the settings ask for and the measurements can carry.
 
@@ -155,17 +155,17 @@ def make_layout(
     infinite = torch.full_like(like[:, 0], torch.inf)
     far = torch.full_like(infinite, TRANSLATION_SIGMA_MM)
     entries: list[tuple[str, int, Tensor]] = [("rotation", 3, infinite), ("translation", 3, far)]
-    if settings.stereo and packed.cameras == 2:
+    if settings.stereo and measured.cameras == 2:
         entries += [("stereo_rotation", 3, stereo_rad), ("stereo_translation", 3, stereo_mm)]
-    if settings.radius and packed.has_contours:
+    if settings.radius and measured.has_contours:
         entries.append(("radius", 1, settings.radius_sigma_relative * origin.radius))
-    if settings.end_offset and packed.has_ends:
+    if settings.end_offset and measured.has_ends:
         entries.append(("end_offset", 1, torch.full_like(infinite, settings.end_offset_sigma_mm)))
     if settings.rcm_offset:
         entries.append(("rcm_offset", 2, torch.full_like(infinite, settings.rcm_offset_sigma_mm)))
-    if settings.joint_offsets != "never" and packed.joint is not None and nominal.joint_offset_sigma.shape[1] > 0:
-        entries.append(("joint_offset", packed.joint.shape[1], nominal.joint_offset_sigma))
-    if settings.clock and packed.clock is not None:
+    if settings.joint_offsets != "never" and measured.joint is not None and nominal.joint_offset_sigma.shape[1] > 0:
+        entries.append(("joint_offset", measured.joint.shape[1], nominal.joint_offset_sigma))
+    if settings.clock and measured.clock is not None:
         entries.append(("clock", 1, torch.full_like(infinite, settings.clock_sigma_s)))
     if settings.edge_bias:
         entries.append(("edge_bias", origin.edge_bias[0].numel(), nominal.edge_bias.flatten(1)))
@@ -181,9 +181,9 @@ def make_layout(
 
 def columns(
     layout: ParameterLayout,
-    rows: Rows,
+    linear: LinearisedRows,
     shaft: Shaft,
-    packed: MeasurementRows,
+    measured: MeasurementRows,
     state: State,
     out: Float[Tensor, "k p b n"] | None = None,
 ) -> Float[Tensor, "k p b n"]:
@@ -193,54 +193,54 @@ def columns(
         out: where to write it.
     """
     if out is None:
-        out = rows.r.new_empty((rows.r.shape[0], layout.size, *rows.r.shape[1:]))
+        out = linear.r.new_empty((linear.r.shape[0], layout.size, *linear.r.shape[1:]))
     by_parameter = out.transpose(0, 1)  # (p, k, b, n)
     right_p = shaft.p[:, 0]
 
     def turned(target: Tensor, lever: Tensor, w: Tensor, a: Tensor) -> None:
         add_cross_(target.copy_(a), lever, w)
 
-    turned(by_parameter[layout.blocks["rotation"]], right_p - state.t.T[..., None], rows.w, rows.a)
-    by_parameter[layout.blocks["translation"]] = rows.w
+    turned(by_parameter[layout.blocks["rotation"]], right_p - state.t.T[..., None], linear.w, linear.a)
+    by_parameter[layout.blocks["translation"]] = linear.w
     for name in ("stereo_rotation", "stereo_translation"):
         if name in layout.blocks:  # rows alternate between the cameras: the left one's are every second
             target = by_parameter[layout.blocks[name]].zero_()[:, 1::2]
             if name == "stereo_rotation":
-                turned(target, right_p, rows.w[:, 1::2], rows.a[:, 1::2])
+                turned(target, right_p, linear.w[:, 1::2], linear.a[:, 1::2])
             else:
-                target.copy_(rows.w[:, 1::2])
+                target.copy_(linear.w[:, 1::2])
     if "radius" in layout.blocks:
-        by_parameter[layout.blocks["radius"]] = rows.radius
+        by_parameter[layout.blocks["radius"]] = linear.radius
     if "end_offset" in layout.blocks:
-        by_parameter[layout.blocks["end_offset"]] = rows.end
+        by_parameter[layout.blocks["end_offset"]] = linear.end
     for name in ("rcm_offset", "joint_offset", "clock"):
         if name in layout.blocks:
-            by_parameter[layout.blocks[name]] = _displaced(name, rows, packed, state)
+            by_parameter[layout.blocks[name]] = _displaced(name, linear, measured, state)
     if "edge_bias" in layout.blocks:
-        out[:, layout.blocks["edge_bias"]] = _shifts(packed, rows.r)
+        out[:, layout.blocks["edge_bias"]] = _shifts(measured, linear.r)
     return out
 
 
-def _displaced(name: str, rows: Rows, packed: MeasurementRows, state: State) -> Float[Tensor, "q k b n"]:
+def _displaced(name: str, linear: LinearisedRows, measured: MeasurementRows, state: State) -> Float[Tensor, "q k b n"]:
     """Columns of the unknowns that move the shaft in `arm`."""
     R = batch_last(state.R, 2)[..., None]
     if name == "rcm_offset":
-        return torch.stack([dot(rows.w, rotate(R, e)[:, None]) for e in rcm_axes(packed)])
-    if packed.joint is not None and name == "joint_offset":
-        return torch.stack([_effect(rows, R, motion) for motion in packed.joint.unbind(1)])
-    if packed.clock is not None and name == "clock":
-        return _effect(rows, R, packed.clock)[None]
+        return torch.stack([dot(linear.w, rotate(R, e)[:, None]) for e in rcm_axes(measured)])
+    if measured.joint is not None and name == "joint_offset":
+        return torch.stack([_effect(linear, R, motion) for motion in measured.joint.unbind(1)])
+    if measured.clock is not None and name == "clock":
+        return _effect(linear, R, measured.clock)[None]
     raise InputError(where=name, expected="derivatives of the kinematics", found="none")
 
 
-def _shifts(packed: MeasurementRows, like: Float[Tensor, "k b n"]) -> Float[Tensor, "k s b n"]:
+def _shifts(measured: MeasurementRows, like: Float[Tensor, "k b n"]) -> Float[Tensor, "k s b n"]:
     """A unit shift of each line row where it was measured; line rows come first."""
-    count = packed.row_kind.count(LINE)
+    count = measured.row_kind.count(LINE)
     unit = torch.eye(like.shape[0], count, dtype=like.dtype, device=like.device)
-    return unit[:, :, None, None] * packed.rows_ok[:, None]
+    return unit[:, :, None, None] * measured.rows_ok[:, None]
 
 
-def _effect(rows: Rows, R: Tensor, displacement: Float[Tensor, "6 b n"]) -> Float[Tensor, "k b n"]:
+def _effect(linear: LinearisedRows, R: Tensor, displacement: Float[Tensor, "6 b n"]) -> Float[Tensor, "k b n"]:
     """Effect of a displacement (rotation, translation; in `arm`) of the shaft on every row."""
     turn, shift = rotate(R, displacement[:3]), rotate(R, displacement[3:])
-    return dot(rows.a, turn[:, None]) + dot(rows.w, shift[:, None])
+    return dot(linear.a, turn[:, None]) + dot(linear.w, shift[:, None])

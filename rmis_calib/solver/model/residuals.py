@@ -133,7 +133,7 @@ class Shaft:
 
 
 @dataclass(frozen=True)
-class Rows:
+class LinearisedRows:
     """Residuals and first-order effects of a rigid motion of the shaft, in `camera_right`; rows of absent
     measurements are zero.
 
@@ -152,32 +152,32 @@ class Rows:
     end: Float[Tensor, "k b n"]
 
 
-def camera_poses(packed: MeasurementRows, state: State) -> tuple[Float[Tensor, "b c 3 3"], Float[Tensor, "b c 3"]]:
+def camera_poses(measured: MeasurementRows, state: State) -> tuple[Float[Tensor, "b c 3 3"], Float[Tensor, "b c 3"]]:
     """`camera_T_camera_right` of the state."""
-    R, t = packed.camera_R.permute(3, 2, 0, 1), packed.camera_t.permute(2, 1, 0)
-    if packed.cameras == 2:
+    R, t = measured.camera_R.permute(3, 2, 0, 1), measured.camera_t.permute(2, 1, 0)
+    if measured.cameras == 2:
         R, t = torch.stack((R[:, 0], state.stereo_R), dim=1), torch.stack((t[:, 0], state.stereo_t), dim=1)
     return R, t
 
 
-def rcm_axes(packed: MeasurementRows) -> tuple[Float[Tensor, "3 b n"], Float[Tensor, "3 b n"]]:
+def rcm_axes(measured: MeasurementRows) -> tuple[Float[Tensor, "3 b n"], Float[Tensor, "3 b n"]]:
     """Two unit directions across the shaft, fixed to `rcm`, in `arm`: the axis of `rcm` that follows the one nearest to
     the shaft (x, y, z, x) made perpendicular to it, and the shaft times that.
 
     The offset is one constant only while the choice stays the same: while the shaft keeps within 45 degrees of one
     axis. (To compare the two axes that lie across the shaft instead changes the choice from motion to motion.)
     """
-    along = torch.stack([dot(packed.R[:, i], packed.v).abs() for i in range(3)])
+    along = torch.stack([dot(measured.R[:, i], measured.v).abs() for i in range(3)])
     nearest = along.argmax(0)
-    axis = torch.where(nearest == 2, packed.R[:, 0], torch.where(nearest == 0, packed.R[:, 1], packed.R[:, 2]))
-    e1 = unit(axis - dot(axis, packed.v) * packed.v)
-    return e1, cross(packed.v, e1)
+    axis = torch.where(nearest == 2, measured.R[:, 0], torch.where(nearest == 0, measured.R[:, 1], measured.R[:, 2]))
+    e1 = unit(axis - dot(axis, measured.v) * measured.v)
+    return e1, cross(measured.v, e1)
 
 
-def predict_shaft(packed: MeasurementRows, state: State) -> Shaft:
+def predict_shaft(measured: MeasurementRows, state: State) -> Shaft:
     """The shaft in the frame of each camera."""
-    arm_p, arm_v, arm_head = _corrected(packed, state)
-    camera_R, camera_t = camera_poses(packed, state)
+    arm_p, arm_v, arm_head = _corrected(measured, state)
+    camera_R, camera_t = camera_poses(measured, state)
     R = camera_R @ state.R[:, None]
     t = (camera_R @ state.t[:, None, :, None])[..., 0] + camera_t
     p = rotate_trials(R, arm_p) + t.permute(2, 1, 0)[..., None]
@@ -185,21 +185,21 @@ def predict_shaft(packed: MeasurementRows, state: State) -> Shaft:
     M = cross(p, d)
     D = dot(M, M).sqrt().clamp_min(1e-9)
     s0 = dot(p, d)
-    head = rotate_trials(R, arm_head) if packed.has_heads else d
+    head = rotate_trials(R, arm_head) if measured.has_heads else d
     return Shaft(p=p, d=d, m=M / D, u=torch.addcmul(p, s0, d, value=-1.0) / D, D=D, s0=s0, head=head)
 
 
-def _corrected(packed: MeasurementRows, state: State) -> tuple[Tensor, Tensor, Tensor]:
+def _corrected(measured: MeasurementRows, state: State) -> tuple[Tensor, Tensor, Tensor]:
     """RCM, direction and head vector in `arm` with the estimated offsets applied, to first order in the rotation."""
-    p, v, head = packed.p, packed.v, packed.head
+    p, v, head = measured.p, measured.v, measured.head
     if bool((state.rcm_offset != 0).any()):
-        e1, e2 = rcm_axes(packed)
+        e1, e2 = rcm_axes(measured)
         p = p + state.rcm_offset[:, 0, None] * e1 + state.rcm_offset[:, 1, None] * e2
     displacement = None
-    if packed.joint is not None and bool((state.joint_offset != 0).any()):
-        displacement = (packed.joint * state.joint_offset.T[:, :, None]).sum(1)
-    if packed.clock is not None and bool((state.clock != 0).any()):
-        moved = packed.clock * state.clock[:, None]
+    if measured.joint is not None and bool((state.joint_offset != 0).any()):
+        displacement = (measured.joint * state.joint_offset.T[:, :, None]).sum(1)
+    if measured.clock is not None and bool((state.clock != 0).any()):
+        moved = measured.clock * state.clock[:, None]
         displacement = moved if displacement is None else displacement + moved
     if displacement is not None:
         p = p + displacement[3:]
@@ -208,57 +208,57 @@ def _corrected(packed: MeasurementRows, state: State) -> tuple[Tensor, Tensor, T
     return p, v, head
 
 
-def residual_rows(packed: MeasurementRows, state: State) -> Float[Tensor, "k b n"]:
+def residual_rows(measured: MeasurementRows, state: State) -> Float[Tensor, "k b n"]:
     """Residuals alone."""
-    shaft = predict_shaft(packed, state)
-    parts = [_line_geometry(packed, state, shaft).f.flatten(0, 1)]
-    if packed.has_ends:
-        parts.append(_end_geometry(packed, state, shaft)[0])
-    if packed.has_heads:
-        parts.append(_head_geometry(packed, shaft)[0].flatten(0, 1))
-    return torch.where(packed.rows_ok, torch.cat(parts), 0.0)
+    shaft = predict_shaft(measured, state)
+    parts = [_line_geometry(measured, state, shaft).f.flatten(0, 1)]
+    if measured.has_ends:
+        parts.append(_end_geometry(measured, state, shaft)[0])
+    if measured.has_heads:
+        parts.append(_head_geometry(measured, shaft)[0].flatten(0, 1))
+    return torch.where(measured.rows_ok, torch.cat(parts), 0.0)
 
 
-def linearise(packed: MeasurementRows, state: State) -> tuple[Rows, Shaft]:
+def linearise(measured: MeasurementRows, state: State) -> tuple[LinearisedRows, Shaft]:
     """Residuals with their effects of a rigid motion of the shaft.
 
     n, m and u all lie across d, so d x n = cos(alpha) u - rho sin(alpha) m and d x u = -m: w and a of lines and ends
     are combinations of the axes m, u and d, which alone are turned into `camera_right`.
     """
-    shaft = predict_shaft(packed, state)
-    camera_R, _ = camera_poses(packed, state)
+    shaft = predict_shaft(measured, state)
+    camera_R, _ = camera_poses(measured, state)
     m, u, d = _into_right(camera_R, torch.stack((shaft.m, shaft.u, shaft.d), dim=1)).unsqueeze(2).unbind(1)
-    lines, c = packed.line_xy.shape[1], packed.cameras
-    ends = c * packed.has_ends
-    shape = (lines * c + ends + 2 * c * packed.has_heads, *shaft.D.shape[1:])
+    lines, c = measured.line_xy.shape[1], measured.cameras
+    ends = c * measured.has_ends
+    shape = (lines * c + ends + 2 * c * measured.has_heads, *shaft.D.shape[1:])
     r, radius, end = (shaft.D.new_zeros(shape) for _ in range(3))
     w, a = (shaft.D.new_empty((3, *shape)) for _ in range(2))
-    seen, ok = _line_geometry(packed, state, shaft), packed.line_ok
+    seen, ok = _line_geometry(measured, state, shaft), measured.line_ok
     part = slice(0, lines * c)
     kappa, kappa_s = torch.where(ok, seen.kappa, 0.0), torch.where(ok, seen.kappa_s, 0.0)
     r[part] = torch.where(ok, seen.f, 0.0).flatten(0, 1)
-    radius[part] = (kappa * packed.line_rho).flatten(0, 1)
+    radius[part] = (kappa * measured.line_rho).flatten(0, 1)
     for out, along_m, along_u in (
         (w, -kappa * seen.cosine, -kappa * seen.sine),
         (a, kappa_s * seen.sine, -kappa_s * seen.cosine),
     ):
         out = out[:, part].unflatten(1, (lines, c))
         torch.mul(along_m, m, out=out).addcmul_(along_u, u)
-    if packed.has_ends:
+    if measured.has_ends:
         part = slice(lines * c, lines * c + ends)
-        e, chi, s_end, gain = _end_geometry(packed, state, shaft)
-        gain = torch.where(packed.end_ok, gain, 0.0)
-        r[part], end[part] = torch.where(packed.end_ok, e, 0.0), -gain
+        e, chi, s_end, gain = _end_geometry(measured, state, shaft)
+        gain = torch.where(measured.end_ok, gain, 0.0)
+        r[part], end[part] = torch.where(measured.end_ok, e, 0.0), -gain
         torch.mul(-gain, d[:, 0], out=w[:, part]).addcmul_(gain * chi, u[:, 0])
         torch.mul(-gain * chi * s_end, m[:, 0], out=a[:, part])
-    if packed.has_heads:
+    if measured.has_heads:
         part = slice(lines * c + ends, None)
-        e, w_head = _head_geometry(packed, shaft)
+        e, w_head = _head_geometry(measured, shaft)
         both = torch.cat((w_head, cross(shaft.head[:, None].expand_as(w_head), w_head)), dim=1)
-        both = torch.where(packed.head_ok, _into_right(camera_R, both), 0.0)
-        r[part] = torch.where(packed.head_ok, e, 0.0).flatten(0, 1)
+        both = torch.where(measured.head_ok, _into_right(camera_R, both), 0.0)
+        r[part] = torch.where(measured.head_ok, e, 0.0).flatten(0, 1)
         w[:, part], a[:, part] = both[:, :2].flatten(1, 2), both[:, 2:].flatten(1, 2)
-    return Rows(r=r, w=w, a=a, radius=radius, end=end), shaft
+    return LinearisedRows(r=r, w=w, a=a, radius=radius, end=end), shaft
 
 
 def _into_right(camera_R: Float[Tensor, "b c 3 3"], v: Float[Tensor, "3 m c b n"]) -> Float[Tensor, "3 m c b n"]:
@@ -286,9 +286,9 @@ class LineGeometry:
     n_image: Float[Tensor, "2 l c b n"]
 
 
-def _line_geometry(packed: MeasurementRows, state: State, shaft: Shaft) -> LineGeometry:
-    x, y = packed.line_xy.unbind()
-    sine = (packed.line_rho * (state.radius[:, None] / shaft.D)).clamp(-MAX_SINE, MAX_SINE)
+def _line_geometry(measured: MeasurementRows, state: State, shaft: Shaft) -> LineGeometry:
+    x, y = measured.line_xy.unbind()
+    sine = (measured.line_rho * (state.radius[:, None] / shaft.D)).clamp(-MAX_SINE, MAX_SINE)
     cosine = (1.0 - sine.square()).sqrt()
     n_image = torch.addcmul(cosine * shaft.m[:2, None], sine, shaft.u[:2, None])
     n_xy = n_image.square().sum(0).sqrt().clamp_min(1e-12)
@@ -306,9 +306,9 @@ def _along(axis: Float[Tensor, "3 c b n"], x: Float[Tensor, "*l c b n"], y: Floa
     return torch.addcmul(torch.addcmul(third, first, x), second, y)
 
 
-def _end_geometry(packed: MeasurementRows, state: State, shaft: Shaft) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _end_geometry(measured: MeasurementRows, state: State, shaft: Shaft) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """e, chi, s_e and d e / d s_e without its sign, all (c, b, n)."""
-    x, y = packed.end_xy.unbind()
+    x, y = measured.end_xy.unbind()
     u, d, m = shaft.u, shaft.d, shaft.m
     X_u, X_d = _along(u, x, y), _along(d, x, y)
     X_u = torch.where(X_u.abs() < MIN_COSINE, MIN_COSINE, X_u)
@@ -318,16 +318,16 @@ def _end_geometry(packed: MeasurementRows, state: State, shaft: Shaft) -> tuple[
     step = d[:2] - chi * u[:2]
     across = torch.addcmul(step[1] * image_m[0], step[0], image_m[1], value=-1.0)
     slope = (across / m_xy).abs().clamp_min(1e-12) / X_u.abs()
-    s_end = (packed.s_end + state.end_offset[:, None]).expand_as(chi)
+    s_end = (measured.s_end + state.end_offset[:, None]).expand_as(chi)
     return (chi - (shaft.s0 + s_end) / shaft.D) / slope, chi, s_end, (shaft.D * slope).reciprocal()
 
 
-def _head_geometry(packed: MeasurementRows, shaft: Shaft) -> tuple[Tensor, Tensor]:
+def _head_geometry(measured: MeasurementRows, shaft: Shaft) -> tuple[Tensor, Tensor]:
     """e (2, c, b, n) and w (3, 2, c, b, n)."""
     q = shaft.p + shaft.head
     depth = torch.where(q[2].abs() < MIN_COSINE, MIN_COSINE, q[2])
     x, y, zero = q[0] / depth, q[1] / depth, torch.zeros_like(depth)
-    e = torch.stack((packed.head_xy[0] - x, packed.head_xy[1] - y))
+    e = torch.stack((measured.head_xy[0] - x, measured.head_xy[1] - y))
     w = torch.stack(
         (torch.stack((-1.0 / depth, zero)), torch.stack((zero, -1.0 / depth)), torch.stack((x / depth, y / depth)))
     )

@@ -151,14 +151,14 @@ class SeenAxes:
     end_weight: Float[Tensor, "c b n"]
 
 
-def seen_axes(packed: MeasurementRows, radius: Float[Tensor, " b"]) -> SeenAxes:
-    """Axes and ends in space, each from one picture. Needs `packed.has_contours`."""
-    camera_R, camera_t = packed.camera_R[..., None], packed.camera_t[..., None]
-    x, y = packed.line_xy.unflatten(1, (2, 2))  # (edge, point, c, b, n) each
+def seen_axes(measured: MeasurementRows, radius: Float[Tensor, " b"]) -> SeenAxes:
+    """Axes and ends in space, each from one picture. Needs `measured.has_contours`."""
+    camera_R, camera_t = measured.camera_R[..., None], measured.camera_t[..., None]
+    x, y = measured.line_xy.unflatten(1, (2, 2))  # (edge, point, c, b, n) each
     rays = torch.stack((x, y, torch.ones_like(x)))
     n = cross(rays[:, :, 0], rays[:, :, 1])
     n = n / dot(n, n).sqrt().clamp_min(1e-12)  # (3, edge, c, b, n)
-    ok = (packed.line_ok & (packed.line_rho != 0)).all(0)
+    ok = (measured.line_ok & (measured.line_rho != 0)).all(0)
     apart = n[:, 0] - n[:, 1]
     length = dot(apart, apart).sqrt().clamp_min(1e-6)
     u, D = apart / length, radius[:, None] * 2.0 / length
@@ -166,11 +166,11 @@ def seen_axes(packed: MeasurementRows, radius: Float[Tensor, " b"]) -> SeenAxes:
     d = d / dot(d, d).sqrt().clamp_min(1e-12)
     weight = ok.to(D.dtype)
     end, end_weight = D * u, torch.zeros_like(weight)
-    if packed.has_ends:
-        ex, ey = packed.end_xy
+    if measured.has_ends:
+        ex, ey = measured.end_xy
         X_u, X_d = u[0] * ex + u[1] * ey + u[2], d[0] * ex + d[1] * ey + d[2]
         end = D * (u + X_d / torch.where(X_u.abs() < 1e-6, 1e-6, X_u) * d)
-        end_weight = weight * packed.end_ok
+        end_weight = weight * measured.end_ok
     return SeenAxes(
         nearest=rotate_back(camera_R, D * u - camera_t),
         direction=rotate_back(camera_R, d),
@@ -181,17 +181,17 @@ def seen_axes(packed: MeasurementRows, radius: Float[Tensor, " b"]) -> SeenAxes:
 
 
 def contour_starts(
-    packed: MeasurementRows, radius: Float[Tensor, " b"], reweightings: int = 0, all_kinds: bool = True
+    measured: MeasurementRows, radius: Float[Tensor, " b"], reweightings: int = 0, all_kinds: bool = True
 ) -> tuple[Float[Tensor, "b s 3 3"], Float[Tensor, "b s 3"]]:
-    """Starts from contours and, where measured, ends; s = 1 or 3. Needs `packed.has_contours`.
+    """Starts from contours and, where measured, ends; s = 1 or 3. Needs `measured.has_contours`.
 
     Args:
         reweightings: rounds of least absolute deviations; 0 for least squares.
         all_kinds: False for the most accurate one alone.
     """
-    axes = seen_axes(packed, radius)
-    v = packed.v[:, None].expand_as(axes.direction)
-    arm_end = (packed.p + packed.s_end * packed.v)[:, None].expand_as(v)
+    axes = seen_axes(measured, radius)
+    v = measured.v[:, None].expand_as(axes.direction)
+    arm_end = (measured.p + measured.s_end * measured.v)[:, None].expand_as(v)
     kinds: list[float | None] = [None]
     if bool((axes.end_weight.sum((0, 2)) >= 3).all()):
         kinds += [0.0, DIRECTION_LENGTH_MM**2]
@@ -204,7 +204,7 @@ def contour_starts(
             correlation = _correlate(axes.direction, v, weight)
             if mix is None:
                 R = project_to_so3(correlation)
-                t = _translation_from_axes(packed, R, axes.nearest, axes.direction, weight)
+                t = _translation_from_axes(measured, R, axes.nearest, axes.direction, weight)
                 error = _length(axes.direction - _turn(R, v)) * DIRECTION_LENGTH_MM
             else:
                 R, t = _absolute_orientation(axes.end, arm_end, weight, mix * correlation)
@@ -242,10 +242,10 @@ def _absolute_orientation(camera: Tensor, arm: Tensor, weight: Tensor, extra: Te
 
 
 def _translation_from_axes(
-    packed: MeasurementRows, R: Tensor, nearest: Tensor, direction: Tensor, weight: Tensor
+    measured: MeasurementRows, R: Tensor, nearest: Tensor, direction: Tensor, weight: Tensor
 ) -> Tensor:
     """t for which the RCM lies nearest to the axes seen: sum (I - d d^T)(R p + t - c) = 0."""
-    turned = (R @ packed.p.permute(1, 0, 2)).permute(1, 0, 2)[:, None]
+    turned = (R @ measured.p.permute(1, 0, 2)).permute(1, 0, 2)[:, None]
     gap = nearest - turned
     gap = gap - dot(direction, gap) * direction
     eye = torch.eye(3, dtype=R.dtype, device=R.device)

@@ -25,16 +25,16 @@ FLOOR_MM = 0.3
 
 
 def point_starts(
-    packed: MeasurementRows, grid: int, minima: int, reweightings: int = 0
+    measured: MeasurementRows, grid: int, minima: int, reweightings: int = 0
 ) -> tuple[Float[Tensor, "b m 3 3"], Float[Tensor, "b m 3"]]:
     """R and t of all minima, best first is not implied.
 
     Args:
-        packed: with heads or ends.
+        measured: with heads or ends.
         grid, minima: `SolverSettings`.
         reweightings: rounds of least absolute deviations from the best minimum; 0 for least squares.
     """
-    rows, offset, ok = _rows(packed)
+    rows, offset, ok = _rows(measured)
     weight = ok.to(rows.dtype)
     for _ in range(reweightings + 1):
         gram = torch.einsum("kb,kbi,kbj->bij", weight, rows, rows)
@@ -45,22 +45,24 @@ def point_starts(
     return R, t
 
 
-def _rows(packed: MeasurementRows) -> tuple[Float[Tensor, "k b 12"], Float[Tensor, "k b"], Bool[Tensor, "k b"]]:
+def _rows(measured: MeasurementRows) -> tuple[Float[Tensor, "k b 12"], Float[Tensor, "k b"], Bool[Tensor, "k b"]]:
     """kron([X; 1], n) of every plane and point on it, n.o, and whether it was measured."""
     planes = []
-    if packed.has_heads:
-        planes += _ray_planes(packed, packed.head_xy, packed.head_ok, (packed.p + packed.head)[:, None])
-    if packed.has_ends:
-        planes += _ray_planes(packed, packed.end_xy, packed.end_ok, (packed.p + packed.s_end * packed.v)[:, None])
-    (x0, x1), (y0, y1) = packed.line_xy[:, :2]
+    if measured.has_heads:
+        planes += _ray_planes(measured, measured.head_xy, measured.head_ok, (measured.p + measured.head)[:, None])
+    if measured.has_ends:
+        planes += _ray_planes(
+            measured, measured.end_xy, measured.end_ok, (measured.p + measured.s_end * measured.v)[:, None]
+        )
+    (x0, x1), (y0, y1) = measured.line_xy[:, :2]
     n = torch.stack((y0 - y1, x1 - x0, x0 * y1 - y0 * x1))
-    on_axis = packed.line_ok[0] & (packed.line_rho[0] == 0)
-    planes += [(n, packed.p[:, None] + s * packed.v[:, None], on_axis) for s in (0.0, LINE_LEVER_MM)]
+    on_axis = measured.line_ok[0] & (measured.line_rho[0] == 0)
+    planes += [(n, measured.p[:, None] + s * measured.v[:, None], on_axis) for s in (0.0, LINE_LEVER_MM)]
     rows, offsets, oks = [], [], []
     for n, X, ok in planes:
         n = torch.where(ok, n / n.square().sum(0).sqrt().clamp_min(1e-12), 0.0)  # (3, c, b, n)
-        offset = (n * packed.camera_t[..., None]).sum(0)
-        n = rotate_back(packed.camera_R[..., None], n)
+        offset = (n * measured.camera_t[..., None]).sum(0)
+        n = rotate_back(measured.camera_R[..., None], n)
         one = torch.cat((X, torch.ones_like(X[:1]))).expand(-1, *n.shape[1:])
         rows.append((one[:, None] * n[None]).flatten(0, 1).permute(1, 3, 2, 0).flatten(0, 1))
         offsets.append(offset.transpose(1, 2).flatten(0, 1))
@@ -68,7 +70,7 @@ def _rows(packed: MeasurementRows) -> tuple[Float[Tensor, "k b 12"], Float[Tenso
     return torch.cat(rows), torch.cat(offsets), torch.cat(oks)
 
 
-def _ray_planes(packed: MeasurementRows, xy: Tensor, ok: Tensor, X: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
+def _ray_planes(measured: MeasurementRows, xy: Tensor, ok: Tensor, X: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
     """Two planes at right angles through each ray, with the point that lies on them."""
     x, y = xy
     zero, one = torch.zeros_like(x), torch.ones_like(x)

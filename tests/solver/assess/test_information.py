@@ -6,7 +6,7 @@ import torch
 from rmis_calib.errors import InputError
 from rmis_calib.solver import MotionReason, SolverSettings, solve
 from rmis_calib.solver.assess.information import motion_information, select_d_optimal
-from rmis_calib.solver.estimate.map_estimate import solve_joint
+from rmis_calib.solver.estimate.map_estimate import map_estimate
 
 
 @pytest.fixture(scope="module")
@@ -17,17 +17,17 @@ def static(simulate, realistic):
 
 def test_information_of_motions_adds_up(static):
     problem, _ = static
-    fit = solve_joint(problem, SolverSettings(bias_correction=False, robust="off"))
-    each = motion_information(fit.packed, fit.state, fit.layout, fit.noise)[0]
-    prior = torch.diag(fit.layout.sigma[0].square().reciprocal())
+    fit = map_estimate(problem, SolverSettings(bias_correction=False, robust="off"))
+    each = motion_information(fit.model, fit.state)[0]
+    prior = torch.diag(fit.model.layout.sigma[0].square().reciprocal())
     torch.testing.assert_close(torch.linalg.inv(each.sum(0) + prior), fit.covariance[0], rtol=1e-6, atol=1e-12)
 
 
 def test_thinning_picks_better_motions_than_chance(static):
     problem, _ = static
-    fit = solve_joint(problem, SolverSettings())
-    each = motion_information(fit.packed, fit.state, fit.layout, fit.noise)[0]
-    prior = torch.diag(fit.layout.sigma[0].square().reciprocal())
+    fit = map_estimate(problem, SolverSettings())
+    each = motion_information(fit.model, fit.state)[0]
+    prior = torch.diag(fit.model.layout.sigma[0].square().reciprocal())
     index, kept = select_d_optimal(each, prior, 40)
     assert len(index) == 40 == len(set(index.tolist()))
 

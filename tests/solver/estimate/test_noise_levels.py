@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 from rmis_calib.solver import MotionReason, SolverSettings, solve
 from rmis_calib.solver.estimate.bias import expected_score
-from rmis_calib.solver.estimate.map_estimate import solve_joint
+from rmis_calib.solver.estimate.map_estimate import map_estimate
 from rmis_calib.solver.estimate.outliers import chi2_quantile, classify
 from rmis_calib.solver.model.normal_equations import camera_distance2, normal_equations
 from rmis_calib.solver.settings import NoiseSettings, UnknownSettings
@@ -49,23 +49,23 @@ def test_chi2_quantile(probability):
 
 def test_suspicion_by_motion_finds_what_every_camera_test_finds(simulate, realistic):
     problem, _, _ = simulate(trials=2, **realistic)
-    fit = solve_joint(problem, SolverSettings(robust="off"))
-    xy = fit.packed.line_xy.clone()
+    fit = map_estimate(problem, SolverSettings(robust="off"))
+    xy = fit.model.measured.line_xy.clone()
     xy[0, :, 0, :, ::40] += 0.01  # right camera
-    packed = replace(fit.packed, line_xy=xy)
-    normal = normal_equations(packed, fit.state, fit.layout, fit.noise)
-    everywhere = classify(packed, fit.state, fit.noise, 1e-4, 4096)
-    where_suspicious = classify(packed, fit.state, fit.noise, 1e-4, 4096, normal.distance2)
+    model = replace(fit.model, measured=replace(fit.model.measured, line_xy=xy))
+    normal = normal_equations(model, fit.state)
+    everywhere = classify(model, fit.state, 1e-4)
+    where_suspicious = classify(model, fit.state, 1e-4, normal.distance2)
     assert torch.equal(everywhere, where_suspicious)
-    measured = fit.packed.line_ok[:, 0].any(0)[:, ::40]
+    measured = fit.model.measured.line_ok[:, 0].any(0)[:, ::40]
     assert float((everywhere[0, :, ::40] < 0.5)[measured].double().mean()) > 0.8  # some lines run along the shift
     assert float((everywhere[1] > 0.5).double().mean()) > 0.99
 
 
 def test_distances_follow_chi2(simulate, realistic):
     problem, _, _ = simulate(trials=4, **realistic)
-    fit = solve_joint(problem.only("contours", "ends"), SolverSettings(robust="off"))
-    distance2, rows = camera_distance2(fit.packed, fit.state, fit.noise)
+    fit = map_estimate(problem.only("contours", "ends"), SolverSettings(robust="off"))
+    distance2, rows = camera_distance2(fit.model.measured, fit.state, fit.model.noise)
     assert float(distance2[rows == 5].mean()) == pytest.approx(5.0, rel=0.05)
     assert float((distance2[rows == 5] > chi2.isf(0.05, 5)).double().mean()) == pytest.approx(0.05, abs=0.02)
 
@@ -88,9 +88,8 @@ def test_expected_score_equals_brute_force(simulate):
     problem, _, _ = simulate(
         trials=1, positions_instrument=2, pixel_noise_px=0.3, kinematics_noise_mm=1.0, kinematics_noise_deg=1.0
     )
-    fit = solve_joint(problem.only("axis"), SolverSettings(bias_correction=False))
-    pairs = expected_score(fit.packed, fit.state, fit.layout, fit.noise, 64 * 60, 4096, seed=0)
-    again = expected_score(fit.packed, fit.state, fit.layout, fit.noise, 64 * 60, 4096, seed=1)
+    fit = map_estimate(problem.only("axis"), SolverSettings(bias_correction=False))
+    pairs, again = (expected_score(fit.model, fit.state, 64 * 60, seed=seed) for seed in (0, 1))
     sigma = torch.linalg.inv(fit.covariance[0, :6, :6]).diagonal().sqrt()  # of the score
     assert float(((pairs.g - again.g)[0, :6] / sigma).abs().max()) < 0.1
     assert float((pairs.g[0, :6] / sigma).abs().max()) > 0.1  # there is a bias to find
@@ -98,10 +97,12 @@ def test_expected_score_equals_brute_force(simulate):
 
 def test_noise_free_scores_have_no_bias(simulate):
     problem, _, _ = simulate(trials=1, positions_instrument=2)
-    fit = solve_joint(
+    fit = map_estimate(
         problem.only("axis"), SolverSettings(noise=NoiseSettings(estimate="never"), bias_correction=False)
     )
-    quiet = replace(fit.noise, **{name: value * 0.0 for name, value in vars(fit.noise).items() if "_" in name})
-    score = expected_score(fit.packed, fit.state, fit.layout, quiet, 64, 4096, seed=0)
+    quiet = replace(
+        fit.model.noise, **{name: value * 0.0 for name, value in vars(fit.model.noise).items() if "_" in name}
+    )
+    score = expected_score(replace(fit.model, noise=quiet), fit.state, 64, seed=0)
     sigma = torch.linalg.inv(fit.covariance[0, :6, :6]).diagonal().sqrt()
     assert float((score.g[0, :6] / sigma).abs().max()) < 1e-3

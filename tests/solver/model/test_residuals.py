@@ -35,11 +35,11 @@ def scene(simulate):
         rcm_p_head=head,
     )
     X = torch.as_tensor(truth["camera_right_T_arm"])
-    packed = pack(problem, SolverSettings().noise)
+    measured = pack(problem, SolverSettings().noise)
     state = initial_state(NuisancePriors.of(problem), X[:, :3, :3], X[:, :3, 3])
     return (
         problem,
-        packed,
+        measured,
         replace(state, end_offset=torch.full((1,), truth["shaft_end_offset_mm"], dtype=torch.float64)),
         truth,
     )
@@ -48,19 +48,19 @@ def scene(simulate):
 def test_exact_measurements_have_no_residual(simulate):
     problem, truth, _ = simulate(trials=1)
     X = torch.as_tensor(truth["camera_right_T_arm"])
-    packed = pack(problem, SolverSettings().noise)
+    measured = pack(problem, SolverSettings().noise)
     state = replace(
         initial_state(NuisancePriors.of(problem), X[:, :3, :3], X[:, :3, 3]),
         end_offset=torch.full((1,), truth["shaft_end_offset_mm"], dtype=torch.float64),
     )
-    assert packed.row_kind == (LINE,) * 8 + (END,) * 2 + (HEAD,) * 4
-    assert float(residual_rows(packed, state).abs().max()) < 1e-12
+    assert measured.row_kind == (LINE,) * 8 + (END,) * 2 + (HEAD,) * 4
+    assert float(residual_rows(measured, state).abs().max()) < 1e-12
 
 
 def test_line_residual_is_distance_to_contour(scene):
     """Against geometry.lines: the signed distance of the measured point from the line that the contour plane cuts out
     of the image."""
-    problem, packed, state, _ = scene
+    problem, measured, state, _ = scene
     moved = state.moved(
         {
             "rotation": torch.full((1, 3), 0.01, dtype=torch.float64),
@@ -74,7 +74,9 @@ def test_line_residual_is_distance_to_contour(scene):
     lines = planes / torch.linalg.vector_norm(planes[..., :2], dim=-1, keepdim=True)
     xy = problem.contour_xy[0, 0]
     expected = (lines[:, :, None, :2] * xy).sum(-1) + lines[:, :, None, 2]  # (n, edge, point)
-    rows = residual_rows(packed, moved)[: 8 : packed.cameras, 0]  # right camera: edge 0 points 0, 1; edge 1 points 0, 1
+    rows = residual_rows(measured, moved)[
+        : 8 : measured.cameras, 0
+    ]  # right camera: edge 0 points 0, 1; edge 1 points 0, 1
     expected = expected.permute(1, 2, 0).flatten(0, 1)
     expected = torch.where(torch.isnan(expected), 0.0, expected)  # out of the picture
     torch.testing.assert_close(rows, expected, atol=1e-13, rtol=1e-9)
@@ -91,14 +93,14 @@ def test_hand_derived_line_residual():
         "contour_right": np.tile(contour, (3, 1, 1, 1)), "shaft_radius_mm": 4.0,
     }  # fmt: skip
     problem = Problem.from_arrays(arrays).flatten_batch()
-    packed = pack(problem, SolverSettings().noise)
+    measured = pack(problem, SolverSettings().noise)
     state = initial_state(
         NuisancePriors.of(problem),
         torch.eye(3, dtype=torch.float64)[None],
         torch.tensor([[-30.0, 0.0, 100.0]], dtype=torch.float64),
     )
-    assert residual_rows(packed, state)[:, 0, 0].tolist() == pytest.approx([0.01, 0.01, 0.0, 0.0], abs=1e-12)
-    rows, _ = linearise(packed, state)
+    assert residual_rows(measured, state)[:, 0, 0].tolist() == pytest.approx([0.01, 0.01, 0.0, 0.0], abs=1e-12)
+    rows, _ = linearise(measured, state)
     slope = 100.0 * 4.0 / (100.0**2 - 16.0) ** 1.5  # d(edge)/dz
     assert rows.w[2, :, 0, 0].tolist() == pytest.approx(
         [-slope, -slope, slope, slope], rel=1e-3
@@ -106,14 +108,14 @@ def test_hand_derived_line_residual():
 
 
 def test_jacobian_of_every_unknown_equals_autodiff(scene):
-    problem, packed, state, _ = scene
+    problem, measured, state, _ = scene
     settings = SolverSettings(unknowns=EVERYTHING)
-    layout = make_layout(NuisancePriors.of(problem), packed, state, settings.unknowns, settings.noise)
+    layout = make_layout(NuisancePriors.of(problem), measured, state, settings.unknowns, settings.noise)
     assert list(layout.blocks) == [
         "rotation", "translation", "stereo_rotation", "stereo_translation", "radius", "end_offset", "rcm_offset",
         "joint_offset", "clock", "edge_bias",
     ]  # fmt: skip
-    exact = replace_measurements(packed, state)
+    exact = replace_measurements(measured, state)
     rows, shaft = linearise(exact, state)
     analytic = columns(layout, rows, shaft, exact, state)[:, :, 0]  # (k, p, n)
 
@@ -125,11 +127,11 @@ def test_jacobian_of_every_unknown_equals_autodiff(scene):
     assert float(((analytic - numeric) / scale).abs().max()) < 1e-9
 
 
-def replace_measurements(packed, state):
+def replace_measurements(measured, state):
     """Head rows of the shifted head point become exact, so that the Jacobian of first order is the whole Jacobian."""
-    heads = slice(-2 * packed.cameras, None)
-    r = residual_rows(packed, state)[heads].view(2, packed.cameras, *packed.p.shape[1:])
-    return replace(packed, head_xy=packed.head_xy - r)
+    heads = slice(-2 * measured.cameras, None)
+    r = residual_rows(measured, state)[heads].view(2, measured.cameras, *measured.p.shape[1:])
+    return replace(measured, head_xy=measured.head_xy - r)
 
 
 def forced(state, layout, delta):
@@ -155,11 +157,11 @@ def test_absent_measurements_have_zero_rows(simulate):
     axis = problem.axis_xy.clone()
     axis[:, 0, 6] = torch.nan
     contour[:, 0, 6] = torch.nan  # nothing left in the right camera
-    packed = pack(replace(problem, contour_xy=contour, axis_xy=axis), SolverSettings().noise)
-    right = packed.line_ok[:, 0, 0]
+    measured = pack(replace(problem, contour_xy=contour, axis_xy=axis), SolverSettings().noise)
+    right = measured.line_ok[:, 0, 0]
     assert right[:, 4].tolist() == [True] * 4
     assert right[:, 5].tolist() == [True, True, False, False]
-    assert packed.line_rho[:, 0, 0, 5].tolist() == [0.0] * 4
+    assert measured.line_rho[:, 0, 0, 5].tolist() == [0.0] * 4
     assert right[:, 6].tolist() == [False] * 4
 
 
