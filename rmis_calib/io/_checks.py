@@ -12,6 +12,8 @@ Note = Callable[[str], None]
 # The entries of R^T R may differ from the identity by this much: far above the rounding of a printed matrix of seven
 # digits, far below any wrong one.
 ORTHONORMAL_TOLERANCE = 1e-6
+PRINTED_TOLERANCE = 1e-3
+"""The same for a rotation that was printed with four decimals and more: rounding leaves it up to 2e-4 short."""
 
 
 def check_rigid(matrix: np.ndarray, where: str, error: type[InputError], numbers: np.ndarray | None = None) -> None:
@@ -40,6 +42,23 @@ def check_rigid(matrix: np.ndarray, where: str, error: type[InputError], numbers
             i = int(bad.argmax())
             place = where if matrix.ndim == 2 else f"{where}[{i if numbers is None else numbers[i]}]"
             raise error(where=place, expected=expected, found=found(i))
+
+
+def rigid_from_text(rows: list[list[float]], where: str, error: type[InputError], note: Note) -> np.ndarray:
+    """A rigid transform (4, 4) as people print it: a rotation of 4 to 6 decimals is made orthonormal, with a note.
+
+    Raises:
+        error: it is no rigid transform even so.
+    """
+    matrix = np.array(rows, dtype=np.float64)
+    R = matrix[:3, :3]
+    deviation = float(np.abs(R.T @ R - np.eye(3)).max())
+    if ORTHONORMAL_TOLERANCE < deviation <= PRINTED_TOLERANCE and np.linalg.det(R) > 0:
+        left, _, right = np.linalg.svd(R)
+        matrix[:3, :3] = left @ right
+        note(f"{where}: the rotation was printed with few digits (off by {deviation:.1g}) and made orthonormal again")
+    check_rigid(matrix, where, error)
+    return matrix
 
 
 def no_note(sentence: str) -> None:

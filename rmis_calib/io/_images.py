@@ -10,11 +10,14 @@ import cv2
 import numpy as np
 
 from rmis_calib.errors import FileError, VideoError
+from rmis_calib.io._depth import bits_of, eight_bits
 from rmis_calib.io.configs import read_bytes
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
 # Raw pixels are what the camera was calibrated on: no turning by what a file says about orientation.
-_FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+_FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+_LOOKED_AT = 16
+"""Files, spread over the folder, from which the number of bits of 16-bit pictures is told."""
 
 
 class ImageReader:
@@ -29,10 +32,18 @@ class ImageReader:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.notes: tuple[str, ...] = ()
         self._files = [path] if path.is_file() else _list_images(path)
         self.count = len(self._files)
-        height, width, _ = self._decode(self._files[0]).shape
-        self.size: tuple[int, int] = (height, width)
+        self._bits = 8
+        first = self._values(self._files[0])
+        if first.dtype != np.uint8:
+            stride = max(1, self.count // _LOOKED_AT)
+            highest = max(int(self._values(file).max()) for file in self._files[::stride])
+            self._bits = bits_of(highest)
+            if self._bits < 16:
+                self.notes = (f"{path.name}: 16-bit pictures with values up to {highest}, read as {self._bits} bits",)
+        self.size: tuple[int, int] = first.shape[:2]
 
     def read_all(self, every: int = 1) -> Generator[np.ndarray, None, None]:
         """Every n-th frame from the first, (H, W, 3) uint8 RGB."""
@@ -48,8 +59,13 @@ class ImageReader:
                 raise VideoError(where=str(self._files[index]), expected=expected, found=found)
             yield image
 
+    def _decode(self, path: Path) -> np.ndarray:
+        values = self._values(path)
+        return values if values.dtype == np.uint8 else eight_bits(values, self._bits, str(path))
+
     @staticmethod
-    def _decode(path: Path) -> np.ndarray:
+    def _values(path: Path) -> np.ndarray:
+        """(h, w, 3) RGB, uint8 or uint16 as in the file; palettes are looked up, and transparency is left out."""
         try:
             data = read_bytes(path)
         except FileError as error:
@@ -63,6 +79,9 @@ class ImageReader:
             image = None
         if image is None:
             raise VideoError(where=str(path), expected="an image", found="a file that cannot be decoded")
+        if image.dtype not in (np.uint8, np.uint16):
+            expected = "pictures of 8 to 16 bits a colour"
+            raise VideoError(where=str(path), expected=expected, found=f"{image.dtype} numbers")
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 

@@ -16,12 +16,20 @@ FileName = Annotated[str, StringConstraints(min_length=1)]
 Row = Annotated[list[float], Field(min_length=4, max_length=4)]
 Matrix = Annotated[list[Row], Field(min_length=4, max_length=4)]
 Side = Annotated[int, Field(ge=16, le=100_000)]
+Crop = Annotated[list[int], Field(min_length=4, max_length=4), AfterValidator(lambda crop: _inside(crop))]
+"""[u, v, width, height], px, of the calibrated picture."""
 
 
 def _not_degrees(value: float) -> float:
     if abs(value) > FULL_TURN_RAD:
         raise ValueError(f"{DEGREES}; expected at most one turn, found {value:g}")
     return value
+
+
+def _inside(crop: list[int]) -> list[int]:
+    if min(crop[:2]) < 0 or min(crop[2:]) < 16:
+        raise ValueError(f"expected [u, v, width, height] with u, v >= 0 and a size of 16 px or more, found {crop}")
+    return crop
 
 
 def _shaft_diameter(value: float) -> float:
@@ -53,13 +61,31 @@ class RecordingSchema(Schema):
     instrument_arm: Name
     shaft_diameter_mm: ShaftDiameter
     clock_offset_s: float = 0.0
+    stereo_layout: Literal["side_by_side", "top_bottom"] | None = None
+    swapped: bool = False
+    crop_right: Crop | None = None
+    crop_left: Crop | None = None
+    rolling_shutter_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+
+    @property
+    def is_stereo(self) -> bool:
+        return self.left is not None or self.stereo_layout is not None
 
     @model_validator(mode="after")
     def _two_of_each(self) -> "RecordingSchema":
         if self.laparoscope_arm == self.instrument_arm:
             raise ValueError(f"expected two different arms, found {self.instrument_arm!r} for both")
         if self.left == self.right:
-            raise ValueError(f"expected two different videos, found {self.right!r} for both cameras")
+            raise ValueError(
+                f"expected two different videos, found {self.right!r} for both cameras (where one file shows both "
+                "eyes, write stereo_layout: side_by_side or top_bottom, and no left)"
+            )
+        if self.stereo_layout is not None and self.left is not None:
+            raise ValueError(f"expected no left beside stereo_layout (right holds both eyes), found {self.left!r}")
+        if self.swapped and self.stereo_layout is None:
+            raise ValueError("expected stereo_layout beside swapped, found none")
+        if self.crop_left is not None and not self.is_stereo:
+            raise ValueError("expected a left camera beside crop_left, found none")
         return self
 
 

@@ -14,6 +14,16 @@ from av.video.frame import VideoFrame
 
 from rmis_calib.errors import VideoError
 from rmis_calib.io._containers import is_cut_short
+from rmis_calib.io._depth import bits_of, eight_bits
+
+_SIXTEEN_BIT = {name: "gray16le" if name.startswith("gray") else "rgb48le" for name in (
+    "gray16le", "gray16be", "rgb48le", "rgb48be", "rgba64le", "rgba64be", "bgr48le", "bgr48be"
+)}  # fmt: skip
+"""Pixel formats of 16-bit numbers, whose pictures may use fewer bits; other formats say how many they use."""
+_LOOKED_AT = 8
+"""Frames from which the number of bits is told."""
+_MOST_WRONG_STAMPS = 0.1
+"""Share of the frames up to which wrong time stamps are interpolated."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +31,7 @@ class _Index:
     """What the packets say, without decoding: display times in units of the stream's time base, sorted."""
 
     count: int
-    pts: list[int]
+    pts: list[int | None]
     key_pts: list[int]
     promised: int
     """Packets that the container claims to hold; 0 where it claims nothing."""
@@ -40,37 +50,93 @@ class VideoReader:
         VideoError: the file is empty, not a video, or truncated.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, expected_count: int | None = None) -> None:
+        """Open a file.
+
+        Args:
+            path: the file.
+            expected_count: frames that a frame_times.csv lists: it outweighs what the container promises.
+        """
         self.path = path
         self.count = 0
+        self.notes: tuple[str, ...] = ()
         if path.stat().st_size == 0:
             raise VideoError(where=str(path), expected="a video", found="an empty file (0 bytes)")
         with self._open() as (container, stream):
-            self.size: tuple[int, int] = (stream.codec_context.height, stream.codec_context.width)
+            self._size: tuple[int, int] = (stream.codec_context.height, stream.codec_context.width)
             self._rate = stream.average_rate or stream.guessed_rate
             self._time_base = stream.time_base
             index = _read_index(container, stream)
             hides_frames = _has_hidden_packets(container, stream)
-        if min(self.size) <= 0:
+        if min(self._size) <= 0:
             raise VideoError(where=str(path), expected="a video with pictures", found="none that can be decoded")
-        if index.is_damaged or not index.count or index.promised > index.present:
+        promises_more = index.promised > index.present
+        if index.is_damaged or not index.count or (promises_more and expected_count != index.present):
             raise self._truncated(index.promised, index.present)
+        if promises_more:
+            self._note(f"the header promises {index.promised} frames; the {index.present} that are there were read")
         self.count, self._pts, self._key_pts = index.count, index.pts, index.key_pts
-        if hides_frames:
-            decoded = [frame.pts for frame in self._decode()]
-            self.count, self._pts = len(decoded), [pts for pts in decoded if pts is not None]
+        if hides_frames or not self._has_pts:
+            self._pts = [frame.pts for frame in self._decode()]
+            self.count = len(self._pts)
+        if not self._has_pts:
+            self._note_stamps()
+        self._turns, self._bits = self._look_at_first()
+        self.size = self._size if self._turns % 2 == 0 else (self._size[1], self._size[0])
+
+    def _note(self, sentence: str) -> None:
+        self.notes = (*self.notes, f"{self.path.name}: {sentence}")
+
+    def _look_at_first(self) -> tuple[int, int]:
+        """Quarter turns (anticlockwise) that the container asks for, and bits of a picture of 16-bit numbers."""
+        turns, highest = 0, 0
+        for number, frame in zip(range(_LOOKED_AT), self._decode(), strict=False):
+            if number == 0:
+                turns = round(frame.rotation / 90) % 4
+            if frame.format.name not in _SIXTEEN_BIT:
+                break
+            highest = max(highest, int(frame.to_ndarray(format=_SIXTEEN_BIT[frame.format.name]).max()))
+        if turns:
+            self._note(f"pictures are turned by {90 * turns} deg, as the file asks for")
+        bits = bits_of(highest)
+        if 8 < bits < 16:
+            self._note(f"the 16-bit pictures hold values up to {highest}: read as {bits} bits")
+        return turns, bits
 
     @property
     def times_s(self) -> np.ndarray | None:
-        """Time of each frame after the first, (N,); from the container's time stamps, else index / rate."""
-        if self._has_pts and self._time_base is not None:
+        """Time of each frame after the first, (N,); from the container's time stamps, else index / rate.
+
+        A few frames without a stamp, or with that of another one, get a time between their neighbours', and a note.
+        """
+        if self._time_base is None or not self._pts:
+            return np.arange(self.count) / float(self._rate) if self._rate else None
+        if self._has_pts:
             pts = np.array(self._pts, dtype=np.int64)
             return (pts - pts[0]) * float(self._time_base)
-        return np.arange(self.count) / float(self._rate) if self._rate else None
+        stamps = np.array([np.nan if pts is None else float(pts) for pts in self._pts])
+        good = _rising(stamps)
+        if good.sum() < max(2, (1.0 - _MOST_WRONG_STAMPS) * self.count):
+            return np.arange(self.count) / float(self._rate) if self._rate else None
+        numbers = np.arange(self.count)
+        mended = _interpolated(numbers, numbers[good], stamps[good])
+        return (mended - mended[0]) * float(self._time_base)
+
+    def _note_stamps(self) -> None:
+        """Say what became of frames without a time stamp of their own."""
+        stamps = np.array([np.nan if pts is None else float(pts) for pts in self._pts])
+        wrong = np.flatnonzero(~_rising(stamps)).tolist()
+        if self._time_base is None or len(wrong) == self.count:
+            return
+        if len(wrong) > _MOST_WRONG_STAMPS * self.count:
+            self._note(f"{len(wrong)} of {self.count} time stamps are missing or repeated: times are frame / rate")
+        elif wrong:
+            frames = ", ".join(map(str, wrong[:5])) + (", ..." if len(wrong) > 5 else "")
+            self._note(f"no time stamp of its own in frame {frames}: interpolated between the neighbours")
 
     @property
     def _has_pts(self) -> bool:
-        return len(set(self._pts)) == self.count
+        return None not in self._pts and len(set(self._pts)) == self.count
 
     def read_all(self, every: int = 1) -> Generator[np.ndarray, None, None]:
         """Every n-th frame from the first, (H, W, 3) uint8 RGB. All are decoded, but only those turned into RGB.
@@ -150,11 +216,16 @@ class VideoReader:
     def _pixels(self, frame: VideoFrame, number: int) -> np.ndarray:
         if frame.is_corrupt:
             raise VideoError(where=f"{self.path} frame {number}", expected="a whole picture", found="a damaged one")
-        if (frame.height, frame.width) != self.size:
-            expected = f"{self.size[1]} x {self.size[0]} px as before"
+        if (frame.height, frame.width) != self._size:
+            expected = f"{self._size[1]} x {self._size[0]} px as before"
             found = f"{frame.width} x {frame.height}"
             raise VideoError(where=f"{self.path} frame {number}", expected=expected, found=found)
-        return frame.to_ndarray(format="rgb24")
+        if frame.format.name in _SIXTEEN_BIT and self._bits > 8:
+            values = frame.to_ndarray(format=_SIXTEEN_BIT[frame.format.name])
+            image = eight_bits(values, self._bits, f"{self.path} frame {number}")
+        else:
+            image = frame.to_ndarray(format="rgb24")
+        return np.ascontiguousarray(np.rot90(image, self._turns)) if self._turns else image
 
     def _truncated(self, expected: int, found: int) -> VideoError:
         promise = f"{expected} frames" if expected > found else "whole frames"
@@ -165,10 +236,12 @@ class VideoReader:
     def _open(self) -> Iterator[tuple[Any, Any]]:
         try:
             with av.open(str(self.path), metadata_errors="ignore") as container:
-                if len(container.streams.video) != 1:
-                    found = f"{len(container.streams.video)}"
-                    raise VideoError(where=str(self.path), expected="one video stream", found=found)
-                stream = container.streams.video[0]
+                # Cover art is a stream of a single picture that no camera took.
+                attached = av.stream.Disposition.attached_pic | av.stream.Disposition.timed_thumbnails
+                streams = [stream for stream in container.streams.video if not stream.disposition & attached]
+                if len(streams) != 1:
+                    raise VideoError(where=str(self.path), expected="one video stream", found=f"{len(streams)}")
+                stream = streams[0]
                 stream.thread_type = "AUTO"
                 yield container, stream
         except av.FFmpegError as error:
@@ -187,14 +260,30 @@ def _read_index(container: Any, stream: Any) -> _Index:
         if packet.is_discard:  # cut away by an edit list: decoded, never shown
             continue
         count += 1
-        if packet.pts is not None:
-            pts.append(packet.pts)
-            if packet.is_keyframe:
-                key_pts.append(packet.pts)
-    return _Index(count, sorted(pts), sorted(key_pts), stream.frames, present, is_damaged)
+        pts.append(packet.pts)
+        if packet.pts is not None and packet.is_keyframe:
+            key_pts.append(packet.pts)
+    # Without a stamp the place among the others is not known before the pictures are decoded.
+    ordered = pts if None in pts else sorted(pts)
+    return _Index(count, ordered, sorted(key_pts), stream.frames, present, is_damaged)
 
 
 def _has_hidden_packets(container: Any, stream: Any) -> bool:
     """Whether packets and pictures may differ in number: hidden reference frames of VP8, packed B-frames in AVI."""
     codec = stream.codec_context.name
     return codec.startswith(("vp8", "libvpx")) or (codec == "mpeg4" and "avi" in container.format.name)
+
+
+def _rising(stamps: np.ndarray) -> np.ndarray:
+    """(N,) whether each stamp is known and exceeds all known ones before it."""
+    known = np.where(np.isnan(stamps), -np.inf, stamps)
+    before = np.concatenate(([-np.inf], np.maximum.accumulate(known)[:-1]))
+    return known > before
+
+
+def _interpolated(at: np.ndarray, numbers: np.ndarray, stamps: np.ndarray) -> np.ndarray:
+    """Stamps at all frame numbers, on straight lines between the good ones and beyond them."""
+    out = np.interp(at, numbers, stamps)
+    step = (stamps[-1] - stamps[0]) / (numbers[-1] - numbers[0])
+    out = np.where(at < numbers[0], stamps[0] + step * (at - numbers[0]), out)
+    return np.where(at > numbers[-1], stamps[-1] + step * (at - numbers[-1]), out)

@@ -16,6 +16,7 @@ from typing import Any
 import yaml
 
 from rmis_calib.errors import InputError, OutputError, RmisCalibError
+from rmis_calib.io.outputs import check_file, check_folder, is_json_of, remove_own, write_marker
 
 
 @contextmanager
@@ -46,14 +47,15 @@ def atomic_directory(path: str | Path, overwrite: bool = False) -> Iterator[Path
 
     Args:
         path: the folder to make; its parents are made as needed. An existing empty folder is replaced.
-        overwrite: replace an existing folder that holds something; all of its old content goes.
+        overwrite: replace an existing folder that holds something, if all of it was written by this program and has not
+            changed since (outputs.py).
 
     Raises:
         OutputError: `path` is a file, holds something and may not be overwritten, contains the current folder, or
             cannot be written.
     """
     target = Path(path).absolute()
-    _check_replaceable(target, overwrite)
+    check_folder(target, overwrite)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".tmp", dir=target.parent))
@@ -62,10 +64,11 @@ def atomic_directory(path: str | Path, overwrite: bool = False) -> Iterator[Path
         raise _output_error(target, error) from error
     try:
         yield temporary
+        write_marker(temporary)
         for folder, _, names in os.walk(temporary):
             for name in names:
                 _flush(Path(folder, name))
-        _check_replaceable(target, overwrite)
+        check_folder(target, overwrite)
         _swap(temporary, target)
     except RmisCalibError:
         raise
@@ -75,13 +78,20 @@ def atomic_directory(path: str | Path, overwrite: bool = False) -> Iterator[Path
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def write_json(path: str | Path, value: Any) -> None:
+def write_json(path: str | Path, value: Any, overwrite: bool = True) -> None:
     """Write plain values as indented JSON, whole or not at all.
+
+    Args:
+        path: a new file; or one of the same `format` as `value`, which is then replaced.
+        value: plain values.
+        overwrite: whether a file of that format may be replaced.
 
     Raises:
         InputError: a number is NaN or infinite (an unknown number is None).
-        OutputError: the file cannot be written.
+        OutputError: another file is there, or the file cannot be written.
     """
+    format_name = value.get("format") if isinstance(value, dict) else None
+    check_file(Path(path), is_json_of(*([format_name] if format_name else [])), overwrite)
     try:
         text = json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False)
     except ValueError as error:
@@ -94,8 +104,9 @@ def write_yaml(path: str | Path, value: Any) -> None:
     """Write plain values as YAML in the order given, whole or not at all.
 
     Raises:
-        OutputError: the file cannot be written.
+        OutputError: a file is there already, or it cannot be written.
     """
+    check_file(Path(path), lambda _: False, overwrite=False)
     text = yaml.safe_dump(value, sort_keys=False, allow_unicode=True)
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -132,21 +143,12 @@ def _flush(path: Path) -> None:
         os.close(handle)
 
 
-def _check_replaceable(target: Path, overwrite: bool) -> None:
-    if not target.exists():
-        return
-    if not target.is_dir():
-        raise OutputError(where=str(target), expected="a folder to write", found="a file")
-    if Path.cwd().is_relative_to(target.resolve()):
-        found = "the current folder or one above it"
-        raise OutputError(where=str(target), expected="an output folder of its own", found=found)
-    if any(target.iterdir()) and not overwrite:
-        found = "one with content (and no leave to overwrite it)"
-        raise OutputError(where=str(target), expected="a new or empty folder", found=found)
-
-
 def _swap(temporary: Path, target: Path) -> None:
-    """Put `temporary` in the place of `target`; the old content is removed only once the new one stands."""
+    """Put `temporary` in the place of `target`; the old content is removed only once the new one stands.
+
+    Of the old content only files that its marker lists are deleted: what somebody else put there meanwhile stays, in a
+    folder beside the new one.
+    """
     target = target.resolve()
     if not target.exists():
         temporary.rename(target)
@@ -162,7 +164,7 @@ def _swap(temporary: Path, target: Path) -> None:
         raise
     finally:
         if target.exists():
-            shutil.rmtree(old, ignore_errors=True)
+            remove_own(old)
 
 
 def _output_error(target: Path, error: OSError) -> OutputError:

@@ -2,6 +2,7 @@
 
 import difflib
 import re
+import stat
 from collections.abc import Hashable
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import yaml
 
 from rmis_calib.errors import ConfigError, FileError, InputError
 
+_LARGEST_YAML = 16 << 20
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
@@ -40,7 +42,7 @@ def load_yaml(path: str | Path, error: type[InputError] = ConfigError) -> dict[s
         FileError: the file is absent or unreadable.
         ConfigError: (or the `error` given) it is not YAML, or not a mapping; names the line.
     """
-    raw = read_bytes(path)
+    raw = read_bytes(path, _LARGEST_YAML)
     try:
         # Thousands of nested brackets end in a recursion error, thousands of digits in a value error.
         value = yaml.load(raw.decode("utf-8-sig"), Loader=_Yaml12Loader)
@@ -52,17 +54,42 @@ def load_yaml(path: str | Path, error: type[InputError] = ConfigError) -> dict[s
     return value
 
 
-def read_bytes(path: str | Path) -> bytes:
-    """Content of a file.
+def read_bytes(path: str | Path, most: int | None = None) -> bytes:
+    """Content of an ordinary file.
+
+    Args:
+        path: the file.
+        most: bytes that such a file may have at most.
 
     Raises:
-        FileError: it is absent, a folder or unreadable.
+        FileError: it is absent, unreadable, too large, or a folder, pipe or device (which might never end).
     """
+    check_regular(path, most)
     try:
         return Path(path).read_bytes()
     except OSError as problem:
+        raise FileError(where=str(path), expected="a readable file", found=problem.strerror) from problem
+
+
+def check_regular(path: str | Path, most: int | None = None) -> None:
+    """Refuse what is not an ordinary file of at most `most` bytes.
+
+    Raises:
+        FileError: see `read_bytes`.
+    """
+    try:
+        status = Path(path).stat()
+    except OSError as problem:
         found = "nothing there" if isinstance(problem, FileNotFoundError) else problem.strerror
         raise FileError(where=str(path), expected="a readable file", found=found) from problem
+    except ValueError as problem:  # a NUL in the name
+        raise FileError(where=repr(str(path)), expected="a file name", found=str(problem)) from problem
+    if not stat.S_ISREG(status.st_mode):
+        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe, socket or device"
+        raise FileError(where=str(path), expected="a readable file", found=kind)
+    if most is not None and status.st_size > most:
+        expected = f"at most {most / 2**20:g} MB"
+        raise FileError(where=str(path), expected=expected, found=f"{status.st_size / 2**20:.0f} MB")
 
 
 def did_you_mean(word: str, known: list[str]) -> str:

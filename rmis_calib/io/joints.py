@@ -2,9 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -25,6 +23,16 @@ _MIN_GAP_S, _MAX_GAP_S, _GAP_SAMPLES = 0.05, 0.5, 5.0
 # Encoders overshoot a soft limit a little; more than this part of the range is another joint, unit or robot.
 _LIMIT_TOLERANCE = 0.02
 _TIME = "timestamp_s"
+_CONVERTED = {"deg": ("rad", math.pi / 180.0), "m": ("mm", 1000.0)}
+"""Units in a column's name that are ours after a multiplication."""
+_CONTINUOUS_S = 0.1
+"""Median interval up to which a log is a movie of the joints, not a list of poses: only then is a jump no motion."""
+_FASTEST_RAD_S, _FASTEST_MM_S = 20.0, 2000.0
+"""No surgical arm turns or slides this fast (dVRK: 3 rad/s, 500 mm/s)."""
+_LONGEST_SPIKE, _MOST_SPIKES = 3, 0.01
+"""Samples in a row, and share of all samples, up to which wild readings are an encoder's, not the wrong file's."""
+_WRAP_SLACK_RAD = 0.5
+"""A jump within this of a whole turn is a wrap."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +51,9 @@ class JointLog:
     """(T, J)."""
     max_gap_s: float = math.nan
     """Widest interval to interpolate across; NaN: five median sample intervals, at least 0.05 s and at most 0.5 s."""
+    broken: np.ndarray | None = None
+    """(T,) bool: whether something was left out between this sample and the next, so that nothing may be interpolated
+    there; None: nowhere."""
 
     def __post_init__(self) -> None:
         expected = (len(self.timestamps_s), len(self.columns))
@@ -70,7 +81,7 @@ class JointLog:
             expected = f"columns of {', '.join(self.columns)}"
             raise RecordingError(where="joint log", expected=expected, found=", ".join(missing))
         index = [self.columns.index(column) for column in columns]
-        return JointLog(self.timestamps_s, columns, self.values[:, index], self.max_gap_s)
+        return JointLog(self.timestamps_s, columns, self.values[:, index], self.max_gap_s, self.broken)
 
     def at(self, times_s: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, "n j"], Bool[np.ndarray, " n"]]:
         """Readings at some times, interpolated, and where they are known.
@@ -89,7 +100,8 @@ class JointLog:
         fraction = (times_s - start) / np.where(gap > 0, gap, 1.0)
         nearest = np.where(fraction > 0.5, after, before)
         hit = np.abs(times_s - stamps[nearest]) <= _SAME_TIME_S
-        valid = hit | ((fraction >= 0) & (fraction <= 1) & (gap <= self.max_gap_s) & (gap > 0))
+        whole = np.ones(len(before), dtype=bool) if self.broken is None else ~self.broken[before]
+        valid = hit | ((fraction >= 0) & (fraction <= 1) & (gap <= self.max_gap_s) & (gap > 0) & whole)
         values, _ = self.interpolate(np.where(hit & (gap > self.max_gap_s), stamps[nearest], times_s))
         return np.where(valid[:, None], values, np.nan), valid
 
@@ -104,16 +116,30 @@ class JointLog:
             steps = np.diff(self.values, axis=0) / np.diff(self.timestamps_s)[:, None]
             slope = steps.sum(axis=0)  # of the one interval, or none
             return self.values[0] + slope * (inside - self.timestamps_s[0])[..., None], slope + 0.0 * inside[..., None]
-        position, velocity = self._cubic
-        return position(inside), velocity(inside)
+        stamps = self.timestamps_s
+        before = (np.searchsorted(stamps, inside, side="right") - 1).clip(0, len(stamps) - 2)
+        h = (stamps[before + 1] - stamps[before])[..., None]
+        u = (inside - stamps[before])[..., None] / h
+        y0, y1 = self.values[before], self.values[before + 1]
+        m0, m1 = h * self._slope(before), h * self._slope(before + 1)
+        rise = y1 - y0
+        # y0 + m0 u + b u^2 + c u^3: through both samples, with both slopes.
+        b, c = 3.0 * rise - 2.0 * m0 - m1, m0 + m1 - 2.0 * rise
+        return y0 + u * (m0 + u * (b + u * c)), (m0 + u * (2.0 * b + 3.0 * u * c)) / h
 
-    @cached_property
-    def _cubic(self) -> tuple[Any, Any]:
-        from scipy.interpolate import CubicHermiteSpline
+    def _slope(self, at: np.ndarray) -> np.ndarray:
+        """(*n, J) slope of the parabola through a sample and its neighbours; at the ends, of the line to the only one.
 
-        slopes = np.gradient(self.values, self.timestamps_s, axis=0)
-        spline = CubicHermiteSpline(self.timestamps_s, self.values, slopes)
-        return spline, spline.derivative()
+        Only where it is asked for: of millions of samples, few are near a frame.
+        """
+        last = len(self.timestamps_s) - 1
+        left, right = np.maximum(at - 1, 0), np.minimum(at + 1, last)
+        to_left = (self.timestamps_s[at] - self.timestamps_s[left])[..., None]
+        to_right = (self.timestamps_s[right] - self.timestamps_s[at])[..., None]
+        fall, rise = self.values[at] - self.values[left], self.values[right] - self.values[at]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            both = (fall / to_left * to_right + rise / to_right * to_left) / (to_left + to_right)
+            return np.where(to_left == 0, rise / to_right, np.where(to_right == 0, fall / to_left, both))
 
 
 def load_joints(path: str | Path, robot: Robot, arms: tuple[str, ...], note: Note = no_note) -> JointLog:
@@ -130,17 +156,82 @@ def load_joints(path: str | Path, robot: Robot, arms: tuple[str, ...], note: Not
         RecordingError: a column is missing, unexpected or in another unit; an entry is not a finite number or out of
             the joint's range; time does not increase. Names line and column.
     """
-    table = read_table(path)
+    table = _in_our_units(read_table(path, note=note), note)
     columns = tuple(column for arm in arms for column in robot.columns(arm))
     _check_units(table, columns)
     _check_unused_arms(table, robot, arms)
     require_columns(table, (_TIME, *columns))
     stamps = require_increasing(table, _TIME)
-    for arm in arms:
-        for joint, column in zip(robot.arms[arm].joints, robot.columns(arm), strict=True):
-            _check_readings(table, column, joint)
+    joints = {
+        column: joint for arm in arms for column, joint in zip(robot.columns(arm), robot.arms[arm].joints, strict=True)
+    }
+    is_continuous = len(stamps) > 2 and float(np.median(np.diff(stamps))) <= _CONTINUOUS_S
+    spikes = np.zeros(len(stamps), dtype=bool)
     index = [table.columns.index(column) for column in columns]
-    return JointLog(stamps, columns, table.values[:, index])
+    values = table.values[:, index]
+    for i, column in enumerate(columns):
+        joint = joints[column]
+        wrong = _spikes(stamps, values[:, i], joint) if is_continuous else np.zeros(len(stamps), dtype=bool)
+        _check_readings(table, column, joint, ~wrong)
+        if wrong.any():
+            first = int(wrong.argmax())
+            note(
+                f"{table.where(first, column)}: an encoder spike ({values[first, i]:g} {joint.unit})"
+                + (f", and {int(wrong.sum()) - 1} more" if wrong.sum() > 1 else "")
+                + ": left out, and no joints are known beside it"
+            )
+            spikes |= wrong
+        if is_continuous and joint.type == "revolute":
+            values[:, i] = _unwrapped(values[:, i], ~wrong, column, note)
+    if not spikes.any():
+        return JointLog(stamps, columns, values)
+    kept = np.flatnonzero(~spikes)
+    broken = np.append(np.diff(kept) > 1, False)
+    return JointLog(stamps[kept], columns, values[kept], broken=broken)
+
+
+def _in_our_units(table: Table, note: Note) -> Table:
+    """The table with columns that say degrees or metres turned into radians and millimetres."""
+    columns, values = list(table.columns), table.values
+    for i, column in enumerate(columns):
+        stem, _, unit = column.rpartition("_")
+        if unit in _CONVERTED and stem:
+            ours, factor = _CONVERTED[unit]
+            columns[i] = f"{stem}_{ours}"
+            values[:, i] *= factor
+            note(f"{table.path.name}: column {column} was turned into {columns[i]}")
+    return Table(table.path, tuple(columns), values)
+
+
+def _spikes(stamps: np.ndarray, values: np.ndarray, joint: Joint) -> np.ndarray:
+    """(T,) samples of short runs that a joint cannot have reached and left again: faster than any robot moves, there
+    and back. A step that stays is not one."""
+    fastest = _FASTEST_RAD_S if joint.type == "revolute" else _FASTEST_MM_S
+    change = np.diff(values)
+    if joint.type == "revolute":  # a wrap at half a turn is no jump
+        change = change - 2 * math.pi * np.round(change / (2 * math.pi))
+    jumps = np.flatnonzero(np.abs(change) > fastest * np.diff(stamps))
+    spikes = np.zeros(len(stamps), dtype=bool)
+    start = None
+    for jump in jumps.tolist():
+        if start is not None and jump - start[0] <= _LONGEST_SPIKE and np.sign(change[jump]) != start[1]:
+            spikes[start[0] + 1 : jump + 1] = True
+            start = None
+        else:
+            start = (jump, np.sign(change[jump]))
+    return spikes if spikes.sum() <= max(1, _MOST_SPIKES * len(stamps)) else np.zeros_like(spikes)
+
+
+def _unwrapped(values: np.ndarray, good: np.ndarray, column: str, note: Note) -> np.ndarray:
+    """Angles without jumps of a whole turn."""
+    turns = np.zeros(len(values))
+    steps = np.diff(values[good])
+    wraps = np.abs(steps) > 2 * math.pi - _WRAP_SLACK_RAD
+    if not wraps.any():
+        return values
+    note(f"column {column}: {int(wraps.sum())} jumps of a whole turn were taken for an angle that wraps")
+    turns[good] = np.concatenate(([0.0], np.cumsum(np.where(wraps, -np.sign(steps), 0.0))))
+    return values + 2 * math.pi * turns
 
 
 def _check_units(table: Table, expected: tuple[str, ...]) -> None:
@@ -162,7 +253,7 @@ def _check_unused_arms(table: Table, robot: Robot, arms: tuple[str, ...]) -> Non
             raise RecordingError(where=f"{table.path} line 1", expected=expected, found=found)
 
 
-def _check_readings(table: Table, column: str, joint: Joint) -> None:
+def _check_readings(table: Table, column: str, joint: Joint, good: np.ndarray) -> None:
     values = table.values[:, table.columns.index(column)]
     size = np.abs(values)
     # One sign: a carriage at rest near zero reads noise of both.
@@ -170,10 +261,13 @@ def _check_readings(table: Table, column: str, joint: Joint) -> None:
         found = f"all {len(values)} readings below 1 mm (largest {size.max():g})"
         raise RecordingError(METRES, where=f"{table.path} column {column}", expected="mm", found=found)
     least, most = _reading_range(joint)
-    bad = (values < least) | (values > most)
+    bad = good & ((values < least) | (values > most))
     if bad.any():
         row = int(bad.argmax())
-        hint = DEGREES if joint.type == "revolute" and size[row] > FULL_TURN_RAD else ""
+        # In degrees all readings would lie in the range.
+        turned = np.deg2rad(values[good])
+        degrees = joint.type == "revolute" and turned.min() >= least and turned.max() <= most
+        hint = DEGREES if degrees or (joint.type == "revolute" and size[row] > FULL_TURN_RAD) else ""
         expected = f"a reading of {least:.6g} to {most:.6g} {joint.unit}"
         raise RecordingError(hint, where=table.where(row, column), expected=expected, found=f"{values[row]:g}")
 

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from rmis_calib.errors import RobotError
-from rmis_calib.io._checks import check_rigid
+from rmis_calib.io._checks import Note, no_note, rigid_from_text
 from rmis_calib.io._schemas import ArmSchema, JointSchema, RobotSchema
 from rmis_calib.io._validation import validate
 from rmis_calib.io.configs import config_path, load_yaml
@@ -86,11 +86,12 @@ class Robot:
         return tuple(f"{arm}.{joint.name}_{joint.unit}" for joint in self.arms[arm].joints)
 
 
-def load_robot(name_or_path: str | Path) -> Robot:
+def load_robot(name_or_path: str | Path, note: Note = no_note) -> Robot:
     """A robot from a YAML file, or a shipped preset (`configs/robots`) by name.
 
     Args:
         name_or_path: a preset's name, or a path that ends in .yaml or .yml.
+        note: told what was mended.
 
     Raises:
         FileError: the file is absent or unreadable.
@@ -100,15 +101,15 @@ def load_robot(name_or_path: str | Path) -> Robot:
     if path.suffix.lower() not in (".yaml", ".yml"):
         path = config_path("robots", str(name_or_path), RobotError)
     schema = validate(RobotSchema, load_yaml(path, RobotError), str(path), RobotError)
-    arms = {name: _arm(arm, f"{path}: arms.{name}") for name, arm in schema.arms.items()}
+    arms = {name: _arm(arm, f"{path}: arms.{name}", note) for name, arm in schema.arms.items()}
     return Robot(schema.name, schema.dh_convention, arms)
 
 
-def _arm(schema: ArmSchema, where: str) -> Arm:
-    base_T_arm_base = np.array(schema.base_T_arm_base, dtype=np.float64)
-    end_T_tool = np.eye(4) if schema.end_T_tool is None else np.array(schema.end_T_tool, dtype=np.float64)
-    check_rigid(base_T_arm_base, f"{where}.base_T_arm_base", RobotError)
-    check_rigid(end_T_tool, f"{where}.end_T_tool", RobotError)
+def _arm(schema: ArmSchema, where: str, note: Note) -> Arm:
+    base_T_arm_base = rigid_from_text(schema.base_T_arm_base, f"{where}.base_T_arm_base", RobotError, note)
+    end_T_tool = np.eye(4)
+    if schema.end_T_tool is not None:
+        end_T_tool = rigid_from_text(schema.end_T_tool, f"{where}.end_T_tool", RobotError, note)
     head = schema.head_point
     return Arm(
         base_T_arm_base,

@@ -13,9 +13,8 @@ import torch
 from jaxtyping import Int64, UInt8
 from torch import Tensor
 
-from rmis_calib.errors import FileError, InputError, VideoError
-from rmis_calib.io._images import SUFFIXES, ImageReader
-from rmis_calib.io._video_file import VideoReader
+from rmis_calib.errors import InputError
+from rmis_calib.io.readers import Reader, open_reader
 
 # Batches decoded ahead of the consumer: one hides the decoding behind the detection, one more rides out a key frame.
 _BATCHES_AHEAD = 2
@@ -42,7 +41,7 @@ class FrameSource:
             images and for a video that has neither.
     """
 
-    def __init__(self, reader: VideoReader | ImageReader) -> None:
+    def __init__(self, reader: Reader) -> None:
         self._reader = reader
         self.path: Path = reader.path
         self.size: tuple[int, int] = reader.size
@@ -123,14 +122,7 @@ def open_source(path: str | Path) -> FrameSource:
         FileError: nothing is there.
         VideoError: it is empty, truncated or not what it seems.
     """
-    path = Path(path)
-    if not path.exists():
-        raise FileError(where=str(path), expected="a video or a folder of images", found="nothing there")
-    try:
-        is_images = path.is_dir() or path.suffix.lower() in SUFFIXES
-        return FrameSource(ImageReader(path) if is_images else VideoReader(path))
-    except PermissionError as error:
-        raise VideoError(where=str(path), expected="a readable file", found=error.strerror) from error
+    return FrameSource(open_reader(path))
 
 
 def _stack(frames: Iterator[np.ndarray], batch_size: int, decoding: Lock) -> np.ndarray | None:

@@ -9,6 +9,7 @@ import pytest
 from rmis_calib.errors import InputError, OutputError, VideoError
 from rmis_calib.io.atomic import atomic_directory, atomic_write, write_json, write_yaml
 from rmis_calib.io.configs import load_yaml
+from rmis_calib.io.outputs import MARKER
 
 is_root = os.geteuid() == 0
 
@@ -104,8 +105,8 @@ def test_directory_appears_whole(tmp_path: Path) -> None:
 def test_interrupted_directory_leaves_nothing(tmp_path: Path, error: type[BaseException], overwrite: bool) -> None:
     target = tmp_path / "out"
     if overwrite:
-        target.mkdir()
-        (target / "old.txt").write_text("old")
+        with atomic_directory(target) as temporary:
+            (temporary / "old.txt").write_text("old")
     with pytest.raises(OutputError if error is OSError else error), atomic_directory(target, overwrite) as temporary:
         (temporary / "half.txt").write_text("x")
         raise error
@@ -118,17 +119,17 @@ def test_directory_is_replaced_only_when_allowed(tmp_path: Path) -> None:
     target.mkdir()
     with atomic_directory(target) as temporary:  # empty: nothing is lost
         (temporary / "a.txt").write_text("1")
-    with pytest.raises(OutputError, match="expected a new or empty folder"), atomic_directory(target):
+    with pytest.raises(OutputError, match="expected a new name, or --overwrite"), atomic_directory(target):
         pytest.fail("must refuse before any work")
     with atomic_directory(target, overwrite=True) as temporary:
         (temporary / "b.txt").write_text("2")
-    assert os.listdir(target) == ["b.txt"]
+    assert sorted(os.listdir(target)) == [MARKER, "b.txt"]
     assert os.listdir(tmp_path) == ["out"]
 
 
 def test_a_folder_filled_meanwhile_is_not_overwritten(tmp_path: Path) -> None:
     target = tmp_path / "out"
-    with pytest.raises(OutputError, match="expected a new or empty folder"), atomic_directory(target):
+    with pytest.raises(OutputError, match="expected a new name, or --overwrite"), atomic_directory(target):
         target.mkdir()
         (target / "theirs.txt").write_text("x")
     assert os.listdir(target) == ["theirs.txt"]
@@ -140,8 +141,8 @@ def test_a_failed_swap_restores_the_old_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
 ) -> None:
     target = tmp_path / "out"
-    target.mkdir()
-    (target / "old.txt").write_text("old")
+    with atomic_directory(target) as temporary:
+        (temporary / "old.txt").write_text("old")
     rename = Path.rename
 
     def failing(self: Path, other: Path) -> Path:
@@ -152,7 +153,7 @@ def test_a_failed_swap_restores_the_old_folder(
     monkeypatch.setattr(Path, "rename", failing)
     with pytest.raises((OutputError, KeyboardInterrupt)), atomic_directory(target, overwrite=True):
         pass
-    assert os.listdir(tmp_path) == ["out"] and os.listdir(target) == ["old.txt"]
+    assert os.listdir(tmp_path) == ["out"] and sorted(os.listdir(target)) == [MARKER, "old.txt"]
 
 
 def test_the_current_folder_is_never_swapped_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

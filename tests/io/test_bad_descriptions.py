@@ -6,7 +6,7 @@ from recording_files import RecordingFolder, identity
 
 from rmis_calib.errors import FileError, RecordingError, RobotError
 
-ONE_ROTATION_OFF = [[1.0, 0.001, 0.0, 5.0], *identity()[1:]]
+ONE_ROTATION_OFF = [[1.0, 0.002, 0.0, 5.0], *identity()[1:]]
 REFLECTION = [[-1.0, 0.0, 0.0, 5.0], *identity()[1:]]
 LAST_ROW = [*identity(5.0)[:3], [0.0, 0.0, 0.001, 1.0]]
 JOINT = "arms__instrument__joints"
@@ -15,7 +15,7 @@ CASES: dict[str, Case] = {
     "no recording.yaml": (
         remove("recording.yaml"),
         FileError,
-        r"recording\.yaml: expected a readable file, found nothing",
+        r"expected a recording: a folder with recording\.yaml, found a folder without it",
     ),
     "no robot": (remove("robot.yaml"), FileError, r"robot\.yaml: expected a readable file, found nothing there"),
     "no stereo": (remove("stereo.yaml"), FileError, r"stereo\.yaml: expected a readable file, found nothing there"),
@@ -124,7 +124,7 @@ CASES: dict[str, Case] = {
     "base not a rotation": (
         edit("robot.yaml", arms__instrument__base_T_arm_base=ONE_ROTATION_OFF),
         RobotError,
-        r"arms\.instrument\.base_T_arm_base: expected an orthonormal rotation .*found a deviation of 0\.001",
+        r"arms\.instrument\.base_T_arm_base: expected an orthonormal rotation .*found a deviation of 0\.002",
     ),
     "tool a reflection": (
         edit("robot.yaml", arms__laparoscope__end_T_tool=REFLECTION),

@@ -71,7 +71,7 @@ def test_what_is_refused_in_one_line(tmp_path: Path, text: str | bytes, message:
 def test_missing_file(tmp_path: Path) -> None:
     with pytest.raises(FileError, match=r"none\.yaml: expected a readable file, found nothing there"):
         load_yaml(tmp_path / "none.yaml")
-    with pytest.raises(FileError, match="Is a directory"):
+    with pytest.raises(FileError, match="found a folder"):
         load_yaml(tmp_path)
 
 

@@ -73,9 +73,7 @@ class MapEstimate:
     @property
     def weight(self) -> Float[Tensor, "c b n"]:
         """Of each camera's measurements of a motion."""
-        measured = self.model.measured
-        everything = torch.ones_like(measured.line_ok[0], dtype=measured.p.dtype)
-        return everything if self.model.weight is None else self.model.weight
+        return _weights(self.model)
 
 
 def map_estimate(problem: Problem, settings: SolverSettings, start: "MapEstimate | None" = None) -> MapEstimate:
@@ -167,7 +165,9 @@ def _finish(problem: Problem, model: WeightedModel, refined: Refined, settings: 
         information = floored_information(normal.H - prior, expected.H, prior) + prior
     scaled, scale = unit_diagonal(information)
     scaled = torch.nan_to_num(scaled, posinf=0.0, neginf=0.0)
-    fit = MapEstimate(
+    sample = slice(None, None, max(1, model.measured.motions // LONG_SAMPLE))
+    used = _weights(model)[..., sample] > REJECTED
+    return MapEstimate(
         problem=problem,
         model=model,
         state=state,
@@ -178,13 +178,15 @@ def _finish(problem: Problem, model: WeightedModel, refined: Refined, settings: 
         distance2=normal.distance2,
         status=refined.status,
         steps=refined.steps,
-        cheirality=torch.empty(0),
+        cheirality=cheirality(model.measured.narrow(slice(None), sample), state, used),
         bias=bias,
         history=refined.history,
     )
-    sample = slice(None, None, max(1, model.measured.motions // LONG_SAMPLE))
-    shown = model.measured.narrow(slice(None), sample)
-    return replace(fit, cheirality=cheirality(shown, state, fit.weight[..., sample] > REJECTED))
+
+
+def _weights(model: WeightedModel) -> Float[Tensor, "c b n"]:
+    everything = torch.ones_like(model.measured.line_ok[0], dtype=model.measured.p.dtype)
+    return everything if model.weight is None else model.weight
 
 
 def _seen_step(

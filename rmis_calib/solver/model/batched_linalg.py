@@ -76,7 +76,7 @@ def unit_diagonal(matrix: Float[Tensor, "*b p p"]) -> tuple[Float[Tensor, "*b p 
     return rescaled(matrix, scale), scale
 
 
-def rescaled(matrix: Float[Tensor, "*b p p"], scale: Float[Tensor, "*b p"]) -> Float[Tensor, "*b p p"]:
+def rescaled(matrix: Float[Tensor, "*#b p p"], scale: Float[Tensor, "*#b p"]) -> Float[Tensor, "*b p p"]:
     """S M S with S = diag(scale)."""
     return matrix * scale[..., :, None] * scale[..., None, :]
 
