@@ -87,12 +87,28 @@ class VideoReader:
     def _note(self, sentence: str) -> None:
         self.notes = (*self.notes, f"{self.path.name}: {sentence}")
 
+    def _quarter_turns(self, frame: VideoFrame) -> int:
+        """Anticlockwise, by the display matrix.
+
+        Raises:
+            VideoError: the matrix asks for a mirrored picture, or for one turned by another angle.
+        """
+        data = frame.side_data.get("DISPLAYMATRIX")
+        if data is None:
+            return 0
+        a, b, _, c, d, *_ = np.frombuffer(bytes(data), dtype=np.int32).tolist()
+        if a * d - b * c < 0 or sorted(map(abs, (a, b, c, d)))[1] != 0:
+            expected = "pictures as the camera took them, or turned by 90, 180 or 270 deg"
+            what = "mirrored pictures" if a * d - b * c < 0 else f"pictures turned by {frame.rotation} deg"
+            raise VideoError(where=str(self.path), expected=expected, found=f"a file that asks for {what}")
+        return round(frame.rotation / 90) % 4
+
     def _look_at_first(self) -> tuple[int, int]:
         """Quarter turns (anticlockwise) that the container asks for, and bits of a picture of 16-bit numbers."""
         turns, highest = 0, 0
         for number, frame in zip(range(_LOOKED_AT), self._decode(), strict=False):
             if number == 0:
-                turns = round(frame.rotation / 90) % 4
+                turns = self._quarter_turns(frame)
             if frame.format.name not in _SIXTEEN_BIT:
                 break
             highest = max(highest, int(frame.to_ndarray(format=_SIXTEEN_BIT[frame.format.name]).max()))
