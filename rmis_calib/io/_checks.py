@@ -53,10 +53,11 @@ def rigid_from_text(rows: list[list[float]], where: str, error: type[InputError]
     matrix = np.array(rows, dtype=np.float64)
     R = matrix[:3, :3]
     deviation = float(np.abs(R.T @ R - np.eye(3)).max())
-    if ORTHONORMAL_TOLERANCE < deviation <= PRINTED_TOLERANCE and np.linalg.det(R) > 0:
+    if deviation <= PRINTED_TOLERANCE and np.linalg.det(R) > 0:
         left, _, right = np.linalg.svd(R)
         matrix[:3, :3] = left @ right
-        note(f"{where}: the rotation was printed with few digits (off by {deviation:.1g}) and made orthonormal again")
+        if deviation > ORTHONORMAL_TOLERANCE:
+            note(f"{where}: the rotation was printed with few digits (off by {deviation:.1g}) and made orthonormal")
     check_rigid(matrix, where, error)
     return matrix
 
