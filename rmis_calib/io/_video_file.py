@@ -63,7 +63,8 @@ class VideoReader:
         if path.stat().st_size == 0:
             raise VideoError(where=str(path), expected="a video", found="an empty file (0 bytes)")
         with self._open() as (container, stream):
-            self._size: tuple[int, int] = (stream.codec_context.height, stream.codec_context.width)
+            codec = stream.codec_context
+            self._size: tuple[int, int] = (0, 0) if codec is None else (codec.height, codec.width)
             self._rate = stream.average_rate or stream.guessed_rate
             self._time_base = stream.time_base
             index = _read_index(container, stream)
@@ -286,7 +287,7 @@ def _read_index(container: Any, stream: Any) -> _Index:
 
 def _has_hidden_packets(container: Any, stream: Any) -> bool:
     """Whether packets and pictures may differ in number: hidden reference frames of VP8, packed B-frames in AVI."""
-    codec = stream.codec_context.name
+    codec = "" if stream.codec_context is None else stream.codec_context.name
     return codec.startswith(("vp8", "libvpx")) or (codec == "mpeg4" and "avi" in container.format.name)
 
 

@@ -1,5 +1,6 @@
 """Joint readings of both arms to the transforms that the calibration needs."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -16,6 +17,10 @@ from rmis_calib.kinematics.dh import JointRow, build_chain, frame_poses
 # A shaft that misses its remote centre by more than this has the wrong frame number or the wrong table: real tables
 # miss it by micrometres, and a wrong frame by centimetres.
 _MAX_RCM_MISS_MM = 1.0
+_LEAST_SPREAD = 0.01
+"""Mean squared sine of the axes' directions from which lines meet in a point, not in a bundle of parallels."""
+_PIVOT_SAMPLES, _PIVOT_MISS_MM = 32, 5.0
+"""Poses of the laparoscope's arm from which its remote centre is told, and how far its axis may pass from it."""
 
 
 @runtime_checkable
@@ -148,6 +153,21 @@ class RobotKinematics:
         rcm_p_head, rcm_p_straight = transform_points(rcm_T_base @ base_T_head, self._head_p_point).unbind(0)
         return InstrumentPose(base_T_rcm, rcm_v_axis, rcm_p_head, (rcm_v_axis * rcm_p_straight).sum(-1))
 
+    def rcm_distance_mm(self) -> float | None:
+        """How far the two arms' remote centres of motion are apart; None where the laparoscope's arm has none.
+
+        The laparoscope's is the point that the axis of one of its joints passes through, whatever the joints read.
+        """
+        if self._laparoscope is None:
+            return None
+        frames = self._laparoscope.frames_in_base(self._laparoscope.spread_readings(_PIVOT_SAMPLES))
+        pivots = [_common_point(frame[:, :3, 3], frame[:, :3, 2]) for frame in frames.unbind(1)]
+        pivot, miss = min(pivots, key=lambda found: found[1])
+        if miss > _PIVOT_MISS_MM:
+            return None
+        rest = self._instrument.spread_readings(1)[0]
+        return float((self.instrument(rest).base_T_rcm[:3, 3] - pivot).norm())
+
     def _check_shaft_meets_rcm(self, where: str) -> None:
         # Two poses far apart: a wrong frame can agree at one of them.
         count = len(self.instrument_joints)
@@ -175,6 +195,7 @@ class _Arm:
             return torch.as_tensor(np.asarray(value), dtype=dtype, device=device)
 
         self.names = tuple(row.name for row in table.joints)
+        self._rows = table.joints
         self.end_T_tool = constant(np.eye(4) if table.end_T_tool is None else table.end_T_tool)
         self._base_T_arm_base = constant(table.base_T_arm_base)
         self._offsets = constant([float(row.offset) for row in table.joints])
@@ -187,8 +208,35 @@ class _Arm:
             found = f"{tuple(joints.shape)} of {joints.dtype}"
             raise ShapeError(where="joint readings", expected=expected, found=found)
 
+    def spread_readings(self, count: int) -> Float[Tensor, "n j"]:
+        """Readings spread over the joints' limits; without limits half a radian, and 100 mm beside what `d` and the
+        offset take back."""
+        part = torch.linspace(0.1, 0.9, count, dtype=self._offsets.dtype, device=self._offsets.device)
+        columns = []
+        for i, row in enumerate(self._rows):
+            low, high = getattr(row, "min", None), getattr(row, "max", None)
+            if low is None or high is None:
+                low, high = (-0.5, 0.5) if row.type == "revolute" else (50.0 - row.offset, 150.0 - row.offset)
+            # Each joint at its own rhythm: a straight line through joint space would leave the axes in one plane.
+            at = ((i + 1) * part * 1.618) % 1.0 if count > 1 else torch.full_like(part, 0.5)
+            columns.append(low + (high - low) * at)
+        return torch.stack(columns, dim=-1)
+
     def frames_in_base(self, joints: Float[Tensor, "*batch j"]) -> Float[Tensor, "*batch frames 4 4"]:
         return self._base_T_arm_base @ frame_poses(self._chain, joints + self._offsets)
+
+
+def _common_point(p: Float[Tensor, "n 3"], d: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], float]:
+    """The point nearest to lines through p along d, and the largest distance of one from it, mm; infinite where the
+    lines are parallel, so that there is none.
+
+    Source: sum (I - d d^T) (x - p) = 0.
+    """
+    across = torch.eye(3, dtype=d.dtype, device=d.device) - d[:, :, None] * d[:, None]
+    if float(torch.linalg.eigvalsh(across.mean(0))[0]) < _LEAST_SPREAD:
+        return p[0], math.inf
+    x = torch.linalg.solve(across.sum(0), (across @ p[..., None]).sum(0))[:, 0]
+    return x, float((across @ (x - p)[..., None])[..., 0].norm(dim=-1).max())
 
 
 def _frame_number(number: int | None, table: ArmTable, where: str) -> int:

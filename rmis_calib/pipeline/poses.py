@@ -7,9 +7,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rmis_calib.errors import RobotError
 from rmis_calib.geometry.rigid import rigid_inverse
 from rmis_calib.io import Recording
 from rmis_calib.kinematics import RobotKinematics
+
+LEAST_RCM_DISTANCE_MM = 5.0
+"""Two trocars are never this near to each other."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +42,7 @@ def motion_poses(recording: Recording, device: str = "cpu") -> MotionPoses:
         RobotError: the robot's description cannot carry the recording's arms.
     """
     kinematics = RobotKinematics(recording.robot, recording.laparoscope_arm, recording.instrument_arm, device=device)
+    _check_apart(recording, kinematics.rcm_distance_mm())
     instrument, known = recording.joints_at_frames(recording.instrument_arm)
     laparoscope, laparoscope_known = recording.joints_at_frames(recording.laparoscope_arm)
     frames = np.flatnonzero(known & laparoscope_known)
@@ -46,4 +51,19 @@ def motion_poses(recording: Recording, device: str = "cpu") -> MotionPoses:
     arm_T_rcm = rigid_inverse(base_T_arm) @ instrument_pose.base_T_rcm
     return MotionPoses(
         frames, arm_T_rcm, instrument_pose.rcm_v_axis, instrument_pose.rcm_s_end_mm, instrument_pose.rcm_p_head
+    )
+
+
+def _check_apart(recording: Recording, distance_mm: float | None) -> None:
+    """Refuse two arms at one place: bases that nobody filled in, as in the shipped presets."""
+    if distance_mm is None or distance_mm >= LEAST_RCM_DISTANCE_MM:
+        return
+    raise RobotError(
+        where=f"robot {recording.robot.name}",
+        expected=(
+            "two arms with remote centres apart: fill base_T_arm_base of "
+            f"arms.{recording.laparoscope_arm} and arms.{recording.instrument_arm} (where each arm's base stands on "
+            "that day; copy a preset to robot.yaml beside recording.yaml first, and write robot: robot.yaml)"
+        ),
+        found=f"both within {max(distance_mm, 0.1):.1f} mm of one point",
     )
