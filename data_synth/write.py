@@ -16,6 +16,7 @@ import numpy as np
 import yaml
 from av.video.stream import VideoStream
 
+from data_synth.folders import check_replaceable, remove_listed, write_marker
 from data_synth.kinematics import Array, pose_noise, rigid_inverse
 from data_synth.motion import log_times
 from data_synth.presets import config_to_dict
@@ -44,17 +45,16 @@ def write_recording(
         path: folder to make.
         config: what to render; the defaults when None.
         device: torch device that draws.
-        overwrite: replace a recording that is already there.
+        overwrite: replace a folder that is already there, if all of it was written by this function.
         on_progress: called with (frames done, frames in all), a stereo pair counting once.
     Returns:
         the folder.
     Raises:
-        FileExistsError: the path exists and `overwrite` is False, or it is something else than a recording.
+        FileExistsError: something is there and `overwrite` is False, or this function did not write all of it.
     """
     config = config or SynthConfig()
     target = Path(path)
-    if target.exists() and not (overwrite and (target / "recording.yaml").is_file()):
-        raise FileExistsError(f"{target}: expected a path that does not exist")
+    check_replaceable(target, overwrite)
     target.parent.mkdir(parents=True, exist_ok=True)
     partial = target.parent / f".{target.name}.partial-{os.getpid()}"
     partial.mkdir()
@@ -63,9 +63,14 @@ def write_recording(
         truths = {side: side_truth(world, side) for side in world.cameras}
         _write_tables(partial, world, truths)
         _write_pictures(partial, world, device, on_progress or (lambda done, total: None))
+        write_marker(partial)
+        check_replaceable(target, overwrite)
+        old = partial.with_name(f"{partial.name}.old")
         if target.exists():
-            shutil.rmtree(target)
+            target.rename(old)
         partial.rename(target)
+        if old.exists():
+            remove_listed(old)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return target

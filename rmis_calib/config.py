@@ -3,7 +3,6 @@
 Nothing here has to be set: `CalibrationConfig()` runs the whole pipeline. Precedence: defaults < one YAML file < flags.
 """
 
-import difflib
 from dataclasses import asdict, field
 from pathlib import Path
 from typing import Any, Literal
@@ -11,8 +10,9 @@ from typing import Any, Literal
 from pydantic import ConfigDict, TypeAdapter, ValidationError, field_validator
 from pydantic.dataclasses import dataclass
 
-from rmis_calib.errors import ConfigError
+from rmis_calib.errors import ConfigError, InputError
 from rmis_calib.io.configs import config_path, load_yaml
+from rmis_calib.io.validation import first_finding
 from rmis_calib.solver.settings import SolverSettings
 from rmis_calib.vision.settings import DetectorSettings
 
@@ -64,28 +64,28 @@ class CalibrationConfig:
     def _known_device(cls, value: str) -> str:
         kind, _, index = value.partition(":")
         if kind not in ("cpu", "cuda") or (index and not index.isdigit()) or value.endswith(":"):
-            raise ValueError("a device is cpu, cuda or cuda:N")
+            raise ValueError("cpu, cuda or cuda:N")
         return value
 
     @field_validator("batch_size", "every", "min_motions")
     @classmethod
     def _positive(cls, value: int) -> int:
         if value < 1:
-            raise ValueError("must be at least 1")
+            raise ValueError("1 or more")
         return value
 
     @field_validator("model_sigma_px", "edge_bias_px", "clock_search_s")
     @classmethod
     def _not_negative(cls, value: float) -> float:
         if value < 0:
-            raise ValueError("must not be negative")
+            raise ValueError("0 or more")
         return value
 
     @field_validator("measurements")
     @classmethod
     def _some_measurement(cls, value: tuple[Measurement, ...]) -> tuple[Measurement, ...]:
         if not {"axis", "contours", "heads"} & set(value):
-            raise ValueError("at least one of axis, contours, heads is needed")
+            raise ValueError("at least one of axis, contours, heads")
         return value
 
     def to_dict(self) -> dict[str, Any]:
@@ -104,16 +104,9 @@ def parse_config(raw: dict[str, Any], where: str = "config") -> CalibrationConfi
         raise config_error(error, where) from None
 
 
-def config_error(error: ValidationError, where: str) -> ConfigError:
+def config_error(error: ValidationError, where: str) -> InputError:
     """The first of pydantic's complaints in our words."""
-    first = error.errors()[0]
-    key = ".".join(str(part) for part in first["loc"])
-    if first["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
-        known = _known_keys(first["loc"][:-1])
-        near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
-        hint = f" (did you mean {near[0]}?)" if near else ""
-        return ConfigError(where=f"{where}: {key}", expected=f"a known key{hint}", found="an unknown one")
-    return ConfigError(where=f"{where}: {key}", expected=first["msg"], found=repr(first["input"]))
+    return first_finding(error, CalibrationConfig, where, ConfigError)
 
 
 def load_config(name_or_path: str | Path) -> CalibrationConfig:
@@ -130,10 +123,3 @@ def load_config(name_or_path: str | Path) -> CalibrationConfig:
     if not isinstance(raw, dict):
         raise ConfigError(where=str(path), expected="a mapping of keys", found=type(raw).__name__)
     return parse_config(raw, where=str(path))
-
-
-def _known_keys(parents: tuple[Any, ...]) -> list[str]:
-    node: Any = CalibrationConfig()
-    for part in parents:
-        node = getattr(node, str(part), node)
-    return list(asdict(node))

@@ -20,9 +20,12 @@ from rmis_calib import __version__
 from rmis_calib.errors import FileError, InputError
 from rmis_calib.geometry.rigid import RigidTransform
 from rmis_calib.io.atomic import write_json
+from rmis_calib.io.outputs import RESULT_FORMAT
 
-RESULT_FORMAT = "rmis-calib-result/1"
 Status = Literal["ok", "weak", "unobservable", "solver_failed", "insufficient_data"]
+
+JOINT_OFFSET = "joint_offset "
+"""How the name of a joint's offset among the nuisances begins; its column without the unit follows."""
 
 STATUS_SENTENCES: dict[str, str] = {
     "ok": "The result passed its own checks",
@@ -72,6 +75,21 @@ class Motions:
 
 
 @dataclass(frozen=True)
+class KinematicOffsets:
+    """What was found to be off in the logged kinematics; zero where it was not estimated.
+
+    Attributes:
+        joints: offset of each joint that has one, by its column (`<arm>.<joint>_rad` or `_mm`), added to its readings.
+        clock_s: added to the times at which the joints are read, beside the recording's own offset.
+        rcm_mm: of the shaft's axis from the nominal RCM, along two directions across it that are fixed to `rcm`.
+    """
+
+    joints: dict[str, float]
+    clock_s: float
+    rcm_mm: tuple[float, float]
+
+
+@dataclass(frozen=True)
 class CalibrationResult:
     """The hand-eye transform, how sure it is, and what it rests on.
 
@@ -113,6 +131,20 @@ class CalibrationResult:
     @property
     def trustworthy(self) -> bool:
         return self.status == "ok"
+
+    @property
+    def kinematic_offsets(self) -> KinematicOffsets:
+        """The offsets among the nuisances: what a prediction must apply to the logged kinematics."""
+
+        def value(name: str) -> float:
+            return float(self.nuisances.get(name, {"value": 0.0})["value"] or 0.0)
+
+        joints = {
+            f"{name.removeprefix(JOINT_OFFSET)}_{entry['unit']}": value(name)
+            for name, entry in self.nuisances.items()
+            if name.startswith(JOINT_OFFSET)
+        }
+        return KinematicOffsets(joints, value("clock"), (value("rcm_offset[0]"), value("rcm_offset[1]")))
 
     @property
     def camera_left_T_arm(self) -> RigidTransform | None:
@@ -157,10 +189,10 @@ class CalibrationResult:
         return finite_or_none(record)
 
     def write(self, path: str | Path) -> None:
-        """Write `result.json`, whole or not at all.
+        """Write `result.json`, whole or not at all; an earlier result there is replaced.
 
         Raises:
-            OutputError: the file cannot be written.
+            OutputError: another file is there, or it cannot be written.
         """
         write_json(Path(path), self.to_dict())
 

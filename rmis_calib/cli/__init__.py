@@ -4,12 +4,13 @@ Exit codes: 0 a result that passed its own checks; 1 no trustworthy result; 2 ba
 traceback); 130 interrupted. Nothing heavy is imported before a command's arguments are understood.
 """
 
-import os
+import difflib
 import sys
 from collections.abc import Sequence
 from importlib import import_module
 
 from rmis_calib import __version__
+from rmis_calib.cli.streams import guarded_output
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("Demo", "render a stereo recording, calibrate it, compare with the truth, leave a report"),
@@ -24,23 +25,32 @@ EXIT_OK, EXIT_NOT_TRUSTWORTHY, EXIT_BAD_INPUT, EXIT_BUG, EXIT_INTERRUPTED = 0, 1
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit code."""
-    argv = list(sys.argv[1:] if argv is None else argv)
+    """Run one command; returns the exit code, which follows the result and never the reader of standard output."""
+    with guarded_output() as output:
+        code = _run(list(sys.argv[1:] if argv is None else argv))
+        output.flush()
+        if output.failure:
+            code = _fail(f"standard output: expected a place that can be written, found {output.failure}")
+    return code
+
+
+def _run(argv: list[str]) -> int:
+    if argv and argv[0] == "help":
+        argv = [*argv[1:2], "--help"]
     if not argv or argv[0] in ("-h", "--help"):
         print(_overview())
         return EXIT_OK if argv else EXIT_BAD_INPUT
-    if argv[0] == "--version":
+    if argv[0] in ("--version", "-V"):
         print(f"rmis-calib {__version__}")
         return EXIT_OK
     if argv[0] not in COMMANDS:
-        return _fail(f"unknown command {argv[0]!r}; expected one of {', '.join(COMMANDS)}")
+        near = difflib.get_close_matches(argv[0], COMMANDS, n=1)
+        hint = f" (did you mean {near[0]}?)" if near else ""
+        return _fail(f"unknown command {argv[0]!r}{hint}; expected one of {', '.join(COMMANDS)}")
     try:
         command = import_module("rmis_calib.cli.commands").parse(COMMANDS[argv[0]][0], argv[0], argv[1:])
-    except SystemExit as exit_request:  # tyro has printed the help, or what is wrong with the usage
+    except SystemExit as exit_request:  # tyro has printed the help
         return int(exit_request.code or 0)
-    except BrokenPipeError:  # the help, to a reader that has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return EXIT_OK
     except Exception as error:
         return _report(error)
     try:
@@ -74,7 +84,7 @@ def _fail(message: str) -> int:
 
 def _overview() -> str:
     lines = [f"rmis-calib {__version__}: markerless hand-eye calibration of a stereo laparoscope", ""]
-    lines += ["usage: rmis-calib COMMAND [OPTIONS]     (rmis-calib COMMAND --help for one command's options)", ""]
+    lines += ["usage: rmis-calib COMMAND [OPTIONS]     (rmis-calib help COMMAND for one command's options)", ""]
     lines += [f"  {name:<10} {sentence}" for name, (_, sentence) in COMMANDS.items()]
     lines += [
         "",

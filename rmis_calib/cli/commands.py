@@ -11,9 +11,23 @@ from pydantic import ValidationError
 
 from rmis_calib.cli import EXIT_NOT_TRUSTWORTHY, EXIT_OK
 from rmis_calib.cli.console import ProgressCallback, console, print_advice, print_table, progress_reporter
-from rmis_calib.config import CalibrationConfig, config_error, load_config
+from rmis_calib.cli.usage import parse_arguments
+from rmis_calib.config import CalibrationConfig, load_config
+from rmis_calib.errors import FileError, InputError, OutputError
+from rmis_calib.io.folders import DESCRIPTION, recording_folder
+from rmis_calib.io.outputs import (
+    EVALUATION_FORMAT,
+    RESULT_FORMAT,
+    check_apart,
+    check_file,
+    check_folder,
+    is_json_of,
+    numbered,
+)
+from rmis_calib.io.validation import first_finding
 
 if TYPE_CHECKING:
+    from rmis_calib.io import RecordingDescription
     from rmis_calib.results import CalibrationResult
 
 Method = Literal["paper", "global", "joint"]
@@ -24,16 +38,13 @@ def parse(class_name: str, command: str, argv: Sequence[str]) -> Any:
     """The command's arguments; a `--config` file, where given, sets the defaults that flags then override.
 
     Raises:
-        ConfigError: a value that no setting may have; names the setting.
+        SystemExit: help was asked for, and printed.
+        InputError: a word that is not understood, or a value that no setting may have.
     """
     kind = globals()[class_name]
     config = _config_argument(argv)
     default = kind.defaults(load_config(config)) if config and issubclass(kind, _Estimates) else None
-    prog = f"rmis-calib {command}"
-    try:
-        return tyro.cli(kind, args=list(argv), prog=prog, default=default, description=kind.__doc__)
-    except ValidationError as error:  # of the settings as a whole; tyro reports those of single groups itself
-        raise config_error(error, prog) from None
+    return parse_arguments(kind, argv, f"rmis-calib {command}", default)
 
 
 def _config_argument(argv: Sequence[str]) -> str | None:
@@ -70,6 +81,14 @@ class _Estimates:
             return self.settings
         return replace(self.settings, solver=replace(self.settings.solver, method=self.method))
 
+    def inputs(self) -> list[Path]:
+        """Files that the settings name, which exist.
+
+        Raises:
+            FileError: masks or a prior that are not there.
+        """
+        return setting_inputs(self.config, self.settings)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Calibrate(_Estimates):
@@ -80,19 +99,23 @@ class Calibrate(_Estimates):
 
     recording: tyro.conf.Positional[Path]
     """Recording folder."""
-    out: Path
-    """Folder to write; it appears only when everything in it is complete."""
+    out: Path | None = None
+    """Folder to write; it appears only when everything in it is complete. Default: RECORDING_calibration, numbered."""
     overwrite: bool = False
-    """Replace OUT if it exists."""
+    """Replace OUT, if all of it was written by this program."""
     overlays: int = 12
     """Pictures drawn with detected and predicted contours, spread over the recording (-1: every frame)."""
 
     def run(self) -> int:
+        recording_folder(self.recording)
+        from rmis_calib.io.description import read_description
+
+        description = read_description(self.recording)
+        out = self.out or beside(description.path, "_calibration")
+        check_output_folder(out, [*description.inputs, *self.inputs()], self.overwrite)
         with progress_reporter() as progress:
-            result = calibrate_folder(
-                self.recording, self.out, self.resolved(), self.overwrite, self.overlays, progress
-            )
-        return conclude(result, self.out / "report.html")
+            result = calibrate_folder(description, out, self.resolved(), self.overwrite, self.overlays, progress)
+        return conclude(result, out / "report.html")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,17 +124,23 @@ class Solve(_Estimates):
 
     observations: tyro.conf.Positional[Path]
     """Observations file."""
-    out: Path
-    """Result file to write (result.json)."""
+    out: Path | None = None
+    """Result file to write. Default: OBSERVATIONS_result.json, numbered."""
+    overwrite: bool = False
+    """Replace OUT, if it is a result of this program."""
 
     def run(self) -> int:
-        from rmis_calib.io import ShaftObservations
-        from rmis_calib.pipeline import solve
+        from rmis_calib.io.observations import ShaftObservations
 
         observations = ShaftObservations.load(self.observations)
+        out = self.out or beside(self.observations.with_suffix(""), "_result", ".json")
+        check_apart(out, [self.observations, *self.inputs()])
+        check_file(out, is_json_of(RESULT_FORMAT), self.overwrite)
+        from rmis_calib.pipeline import solve
+
         result = solve(observations, self.resolved(), throw=False)
-        result.write(self.out)
-        return conclude(result, self.out)
+        result.write(out)
+        return conclude(result, out)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,16 +155,29 @@ class Evaluate:
     """YAML file with camera_right_T_arm (4x4 rows, mm); default: the recording's ground_truth.yaml where present."""
     out: Path | None = None
     """JSON file for the numbers."""
+    overwrite: bool = False
+    """Replace OUT, if it is an evaluation of this program."""
 
     def run(self) -> int:
-        from rmis_calib.io import write_json
+        recording_folder(self.recording)
+        from rmis_calib.io.description import read_description
+
+        inputs = [path for path in (self.result, self.truth) if path is not None]
+        for path in inputs:
+            if not path.is_file():
+                raise FileError(where=str(path), expected="a readable file", found="nothing there")
+        description = read_description(self.recording)
+        if self.out is not None:
+            check_apart(self.out, [*description.inputs, *inputs])
+            check_file(self.out, is_json_of(EVALUATION_FORMAT), self.overwrite)
+        from rmis_calib.io import load_recording, write_json
         from rmis_calib.pipeline import evaluate
         from rmis_calib.results import CalibrationResult, finite_or_none
 
-        evaluation = evaluate(CalibrationResult.read(self.result), self.recording, self.truth)
+        evaluation = evaluate(CalibrationResult.read(self.result), load_recording(description), self.truth)
         print_table("evaluation", evaluation.rows())
         if self.out is not None:
-            write_json(self.out, finite_or_none(evaluation.to_dict()))
+            write_json(self.out, {"format": EVALUATION_FORMAT} | finite_or_none(evaluation.to_dict()))
         return EXIT_OK
 
 
@@ -149,12 +191,12 @@ class Detect:
 
     source: tyro.conf.Positional[Path]
     """Recording folder, video, folder of images, or one image."""
-    out: Path
-    """Folder to write."""
+    out: Path | None = None
+    """Folder to write. Default: SOURCE_lines, numbered."""
     config: str | None = None
     """YAML file, or name of a shipped preset, that sets the defaults of the flags below."""
     overwrite: bool = False
-    """Replace OUT if it exists."""
+    """Replace OUT, if all of it was written by this program."""
     overlays: int = -1
     """Pictures drawn a camera, spread over the frames (-1: every frame)."""
     overlay_video: bool = False
@@ -167,25 +209,32 @@ class Detect:
     settings: Settings = field(default_factory=CalibrationConfig)
 
     def run(self) -> int:
+        from rmis_calib.io.description import read_description
+        from rmis_calib.io.readers import open_reader
+
+        if (self.source / DESCRIPTION).is_file():
+            inputs = list(read_description(self.source).inputs)
+        else:
+            inputs = [open_reader(self.source).path]
+        out = self.out or beside(self.source if self.source.is_dir() else self.source.with_suffix(""), "_lines")
+        check_output_folder(out, [*inputs, *setting_inputs(self.config, self.settings)], self.overwrite)
         from rmis_calib.io import atomic_directory
         from rmis_calib.pipeline import detect
         from rmis_calib.report import DetectionPictures, PictureChoice, write_lines
 
         choice = PictureChoice(self.overlays, self.overlay_video, self.debug_frames if self.debug else 0)
-        with atomic_directory(self.out, overwrite=self.overwrite) as folder, progress_reporter() as progress:
+        with atomic_directory(out, overwrite=self.overwrite) as folder, progress_reporter() as progress:
             with DetectionPictures(folder, choice) as pictures:
                 table = detect(self.source, self.settings, progress, pictures.add)
             write_lines(folder, table)
         print_table(f"shafts in {self.source}", table.rows())
-        console.print(f"lines: {self.out / 'lines.csv'}   pictures: {self.out / 'overlays'}", soft_wrap=True)
+        say(f"lines: {out / 'lines.csv'}   pictures: {out / 'overlays'}")
         if self.overlay_video:
-            console.print(f"video: {self.out / 'overlay_right.mp4'}", soft_wrap=True)
+            say(f"video: {out / 'overlay_right.mp4'}")
         if self.debug:
             drawn, failed = pictures.sheets.total(), pictures.failed.total()
             more = "" if drawn >= failed else "; --debug-frames -1 draws every frame"
-            console.print(
-                f"stages: {self.out / 'debug'} ({drawn} sheets; {failed} frames without a shaft{more})", soft_wrap=True
-            )
+            say(f"stages: {out / 'debug'} ({drawn} sheets; {failed} frames without a shaft{more})")
         return EXIT_OK
 
 
@@ -202,12 +251,12 @@ class Synth:
     seed: int | None = None
     """Seed of everything random."""
     overwrite: bool = False
-    """Replace OUT if it exists."""
+    """Replace OUT, if all of it was written by this program."""
 
     def run(self) -> int:
         with progress_reporter() as progress:
             render_recording(self.out, self.preset, self.motions, self.seed, self.overwrite, progress)
-        console.print(f"recording: {self.out}")
+        say(f"recording: {self.out}")
         return EXIT_OK
 
 
@@ -222,23 +271,61 @@ class Demo(_Estimates):
     seed: int = 1
     """Seed of the rendering."""
     overwrite: bool = False
-    """Replace OUT if it exists."""
+    """Replace OUT, if all of it was written by this program."""
 
     def run(self) -> int:
-        from rmis_calib.pipeline import evaluate
-
         recording = self.out / "recording"
         calibration = self.out / "calibration"
+        for folder in (recording, calibration):
+            check_output_folder(folder, self.inputs(), self.overwrite)
+        from rmis_calib.io.description import read_description
+        from rmis_calib.pipeline import evaluate
+
         with progress_reporter() as progress:
             render_recording(recording, "demo", self.motions, self.seed, self.overwrite, progress)
-            result = calibrate_folder(recording, calibration, self.resolved(), self.overwrite, 12, progress)
+            description = read_description(recording)
+            result = calibrate_folder(description, calibration, self.resolved(), self.overwrite, 12, progress)
         code = conclude(result, calibration / "report.html")
         print_table("against the truth of the rendering", evaluate(result, recording).rows())
         return code
 
 
+def setting_inputs(config: str | None, settings: CalibrationConfig) -> list[Path]:
+    """Files that a command's settings name, which exist.
+
+    Raises:
+        FileError: masks or a prior that are not there.
+    """
+    for flag, value in (("--masks", settings.masks), ("--prior", settings.prior)):
+        if value is not None and not Path(value).exists():
+            raise FileError(where=f"{flag} {value}", expected="a file or folder", found="nothing there")
+    named = [Path(value) for value in (config, settings.masks, settings.prior) if value is not None]
+    return [path for path in named if path.exists()]
+
+
+def beside(source: Path, ending: str, suffix: str = "") -> Path:
+    """A fresh name beside an input, in the folder that holds it."""
+    named = source if source.name not in ("", "..") else source.resolve()
+    return numbered(named.with_name(named.name + ending), suffix)
+
+
+def check_output_folder(out: Path, inputs: list[Path], overwrite: bool) -> None:
+    """Refuse a folder that may not be written, before any work.
+
+    Raises:
+        OutputError: it is, contains or lies in an input, or holds what this program did not write.
+    """
+    check_apart(out, inputs)
+    check_folder(out.absolute(), overwrite)
+
+
+def say(line: str) -> None:
+    """One line on standard output, as it is: a folder may be called [bold]."""
+    console.print(line, soft_wrap=True, markup=False)
+
+
 def calibrate_folder(
-    source: Path,
+    source: "RecordingDescription",
     out: Path,
     config: CalibrationConfig,
     overwrite: bool,
@@ -267,12 +354,13 @@ def render_recording(
         OutputError: the folder exists already, or cannot be written.
     """
     import data_synth
-    from rmis_calib.errors import InputError, OutputError
 
     changes = {"motions": motions, "seed": seed}
     try:
         config = data_synth.load_synth_config(preset)
         config = replace(config, **{key: value for key, value in changes.items() if value is not None})
+    except ValidationError as error:
+        raise first_finding(error, data_synth.SynthConfig, f"preset {preset}", InputError) from None
     except (FileNotFoundError, ValueError) as error:
         raise InputError(" ".join(str(error).split()), where="--preset") from error
     try:
@@ -280,20 +368,21 @@ def render_recording(
             out, config, overwrite=overwrite, on_progress=lambda done, total: progress("rendering", done, total)
         )
     except FileExistsError as error:
-        raise OutputError(where=str(out), expected="a new folder, or --overwrite", found="one that exists") from error
+        raise OutputError(where=str(out), expected=str(error), found="another one") from error
     except OSError as error:
         raise OutputError(where=str(out), expected="a place that can be written", found=error.strerror) from error
 
 
 def conclude(result: "CalibrationResult", written: Path) -> int:
     """Print the answer and where it is; the exit code says whether to trust it."""
-    console.print(f"[bold]{result.status}[/bold]: {result.message}\n", soft_wrap=True)
+    console.print(result.status, style="bold", end="")
+    say(f": {result.message}\n")
     print_table(result.camera_right_T_arm.name if result.camera_right_T_arm else "no transform", result_rows(result))
     for note in result.notes:
-        console.print(f"note: {note}", soft_wrap=True, markup=False)
+        say(f"note: {note}")
     if not result.trustworthy:
         print_advice(result.observability.get("advice") or [])
-    console.print(f"written: {written}\n", soft_wrap=True)
+    say(f"written: {written}\n")
     return EXIT_OK if result.trustworthy else EXIT_NOT_TRUSTWORTHY
 
 

@@ -8,22 +8,22 @@ from pathlib import Path
 
 import numpy as np
 
-from rmis_calib.errors import FileError, InputError, RecordingError, RobotError, VideoError
+from rmis_calib.errors import InputError, RecordingError, RobotError, VideoError
 from rmis_calib.io._checks import Note
 from rmis_calib.io._eyes import EyeReader
 from rmis_calib.io._schemas import RecordingSchema
-from rmis_calib.io._validation import validate
 from rmis_calib.io.clocks import check_overlap, on_one_clock
 from rmis_calib.io.configs import load_yaml
+from rmis_calib.io.folders import DESCRIPTION, recording_folder
 from rmis_calib.io.joints import JointLog, load_joints
 from rmis_calib.io.readers import Reader, open_reader
 from rmis_calib.io.robot import Robot, load_robot
 from rmis_calib.io.stereo import Intrinsics, StereoFile, read_stereo
 from rmis_calib.io.tables import HeadPoints, read_frame_times, read_head_points
+from rmis_calib.io.validation import validate
 
 # Images of a stereo pair that are further apart than this part of a frame interval do not show one instant.
 _STEREO_SLACK = 0.5
-_DESCRIPTION = "recording.yaml"
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,26 +48,6 @@ class RecordingDescription:
     """The folder, and every file that it names."""
 
 
-def recording_folder(path: str | Path) -> Path:
-    """The folder of a recording, given itself or its recording.yaml.
-
-    Raises:
-        FileError: nothing is there, or no recording; says where one may be.
-    """
-    path = Path(path)
-    folder = path.parent if path.name == _DESCRIPTION else path
-    expected = f"a recording: a folder with {_DESCRIPTION}"
-    if not folder.exists():
-        raise FileError(where=str(path), expected=expected, found="nothing there")
-    if not folder.is_dir():
-        raise FileError(where=str(path), expected=expected, found="a file")
-    if not (folder / _DESCRIPTION).exists():
-        inside = sorted(item.parent for item in folder.glob(f"*/{_DESCRIPTION}"))
-        hint = f" (did you mean {inside[0]}?)" if inside else ""
-        raise FileError(where=str(path), expected=expected, found=f"a folder without it{hint}")
-    return folder
-
-
 def read_description(path: str | Path, clock_offset_s: float | None = None) -> RecordingDescription:
     """Read all text files of a recording, and open its videos.
 
@@ -79,7 +59,7 @@ def read_description(path: str | Path, clock_offset_s: float | None = None) -> R
         FileError, VideoError, RecordingError, RobotError, InputError: as `load_recording`.
     """
     folder = recording_folder(path)
-    where = folder / _DESCRIPTION
+    where = folder / DESCRIPTION
     schema = validate(RecordingSchema, load_yaml(where, RecordingError), str(where), RecordingError)
     offset = schema.clock_offset_s if clock_offset_s is None else clock_offset_s
     if not np.isfinite(offset):
@@ -110,7 +90,7 @@ def _load_robot(schema: RecordingSchema, folder: Path, note: Note) -> Robot:
     """The robot, a preset or a file of the folder, with the arms that the recording names."""
     is_file = Path(schema.robot).suffix.lower() in (".yaml", ".yml")
     robot = load_robot(folder / schema.robot if is_file else schema.robot, note)
-    where = f"{folder / _DESCRIPTION}"
+    where = f"{folder / DESCRIPTION}"
     for key, arm in (("laparoscope_arm", schema.laparoscope_arm), ("instrument_arm", schema.instrument_arm)):
         if arm is not None and arm not in robot.arms:
             expected = f"an arm of robot {robot.name} ({', '.join(robot.arms)})"
@@ -192,7 +172,7 @@ def _frame_times(
         return listed_s
     right_s, left_s = right.times_s, None if left is None else left.times_s
     if right_s is None:
-        where = f"{folder / _DESCRIPTION}: frame_times"
+        where = f"{folder / DESCRIPTION}: frame_times"
         expected = f"a file with the time of each frame of {schema.right}"
         raise RecordingError(where=where, expected=expected, found="none")
     if left is not None and left_s is not None and right.count > 1:

@@ -13,6 +13,7 @@ from rmis_calib.errors import FileError, ObservationsError
 from rmis_calib.io import _observation_checks as checks
 from rmis_calib.io.atomic import atomic_write
 from rmis_calib.io.configs import did_you_mean
+from rmis_calib.io.outputs import OBSERVATIONS_FORMAT, check_file, is_npz_with
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -147,19 +148,22 @@ class ShaftObservations:
             ObservationsError: it is truncated, of another kind, or an array in it is wrong.
         """
         arrays = _read_npz(Path(path))
+        arrays.pop("format", None)  # says which program wrote it
         try:
             return cls.from_arrays(arrays)
         except ObservationsError as error:
             raise ObservationsError(str(error), where=str(path)) from error
 
     def save(self, path: str | Path) -> None:
-        """Write an .npz file, whole or not at all.
+        """Write an .npz file, whole or not at all; one that this program wrote earlier is replaced.
 
         Raises:
-            OutputError: the file cannot be written.
+            OutputError: another file is there, or it cannot be written.
         """
+        check_file(Path(path), is_npz_with("format"), overwrite=True)
+        arrays = self.to_arrays() | {"format": np.array(OBSERVATIONS_FORMAT)}
         with atomic_write(path) as temporary, temporary.open("wb") as file:
-            np.savez(file, **self.to_arrays())  # pyright: ignore[reportArgumentType]
+            np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
 
 
 CLOCK = checks.CLOCK

@@ -17,6 +17,9 @@ from rmis_calib.errors import OutputError
 
 MARKER = ".rmis-calib-output.json"
 MARKER_FORMAT = "rmis-calib-output/1"
+RESULT_FORMAT = "rmis-calib-result/1"
+EVALUATION_FORMAT = "rmis-calib-evaluation/1"
+OBSERVATIONS_FORMAT = "rmis-calib-observations/1"
 HTML_GENERATOR = '<meta name="generator" content="rmis-calib">'
 _HEAD_BYTES = 4096
 _OVERWRITE = "a new name, or --overwrite (overwrite=True) to replace it"

@@ -9,8 +9,8 @@ import numpy as np
 from rmis_calib.errors import RobotError
 from rmis_calib.io._checks import Note, no_note, rigid_from_text
 from rmis_calib.io._schemas import ArmSchema, JointSchema, RobotSchema
-from rmis_calib.io._validation import validate
 from rmis_calib.io.configs import config_path, load_yaml
+from rmis_calib.io.validation import validate
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ import numpy as np
 from rmis_calib.errors import RecordingError
 from rmis_calib.io._checks import Note, no_note, rigid_from_text
 from rmis_calib.io._schemas import METRES, CameraSchema, StereoSchema
-from rmis_calib.io._validation import validate
 from rmis_calib.io.configs import load_yaml, read_bytes
+from rmis_calib.io.validation import validate
 
 # From the closest chip-on-tip pair to a bench rig; a laparoscope has 4 to 6 mm.
 _BASELINE_MM = (0.1, 200.0)

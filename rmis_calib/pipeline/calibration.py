@@ -30,7 +30,12 @@ from rmis_calib.pipeline.estimation import (
     used_motions,
 )
 from rmis_calib.pipeline.evaluation import head_point_errors, summarise_head_points
-from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns, estimated_offsets
+from rmis_calib.pipeline.kinematic_unknowns import (
+    KinematicUnknowns,
+    estimated_offsets,
+    poses_at,
+    with_rcm_offset,
+)
 from rmis_calib.pipeline.next_motion import (
     advice_record,
     camera_view,
@@ -221,7 +226,8 @@ def _solve_choice(
     result = make_result(
         solution, motions, _residuals_px(recording, poses, solution, motions.used), config, columns, notes
     )
-    errors = head_point_errors(result, recording, poses)
+    poses = with_rcm_offset(poses, result.kinematic_offsets.rcm_mm)
+    errors = head_point_errors(result, recording, poses_at(recording, result.kinematic_offsets, config.device))
     residuals = result.residuals | {
         f"head_{side}": residual_record(distance, "px", np.isfinite(distance))
         for side, distance in (errors or {}).items()

@@ -15,7 +15,7 @@ from rmis_calib.pipeline.file_unknowns import FileUnknowns, file_unknowns
 from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns, estimated_offsets
 from rmis_calib.pipeline.next_motion import advice_record, may_advise, seen_view
 from rmis_calib.pipeline.next_pose import WHERE, pose_candidates
-from rmis_calib.results import STATUS_SENTENCES, CalibrationResult, Motions, Status
+from rmis_calib.results import JOINT_OFFSET, STATUS_SENTENCES, CalibrationResult, Motions, Status
 from rmis_calib.solver import Problem, Solution, SolveStatus
 from rmis_calib.solver import solve as solve_problem
 from rmis_calib.solver.estimate.relinearise import scan_clock
@@ -315,7 +315,7 @@ def _nuisance_records(solution: Solution, joint_columns: tuple[str, ...]) -> dic
             key = name if len(values) == 1 else f"{name}[{index}]"
             unit = nuisance.unit
             if name == "joint_offset":
-                key, _, unit = f"{name} {joint_columns[index]}".rpartition("_")
+                key, _, unit = f"{JOINT_OFFSET}{joint_columns[index]}".rpartition("_")
             records[key] = {"value": value, "sigma": sigma, "unit": unit, "held": is_held}
     for name, level in solution.noise.items():
         records[f"noise {name}"] = {"value": float(level), "sigma": None, "unit": _noise_unit(name)}

@@ -1,21 +1,34 @@
 """How good a result is: head-point reprojection error, and the distance to a known truth."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from rmis_calib.errors import InputError
 from rmis_calib.geometry.rigid import RigidTransform, rigid_inverse, transform_points
 from rmis_calib.geometry.rotations import matrix_to_rotvec
 from rmis_calib.io import Recording, load_recording, load_yaml
-from rmis_calib.pipeline.poses import MotionPoses, motion_poses
+from rmis_calib.io._checks import no_note, rigid_from_text
+from rmis_calib.pipeline.kinematic_unknowns import poses_at
+from rmis_calib.pipeline.poses import MotionPoses
 from rmis_calib.results import CalibrationResult
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A transform to compare with.
+
+    Attributes:
+        camera_right_T_arm: the transform.
+        covariance: (6, 6) as in a result; None for one that counts as exact.
+    """
+
+    camera_right_T_arm: RigidTransform
+    covariance: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -24,15 +37,21 @@ class Evaluation:
 
     Attributes:
         head_point_error_px: per camera `{median, rms, max, count}`; None without head points.
-        rotation_error_deg: angle between the result and the truth; None without a truth.
+        rotation_error_deg: angle between the result and the reference; None without a reference.
         translation_error_mm: distance between the two translations.
-        error_sigmas: Mahalanobis distance of the error under the result's own covariance (6 degrees of freedom).
+        error_sigmas: Mahalanobis distance of the error under the sum of both covariances (6 degrees of freedom).
+        result_sigma_deg, result_sigma_mm: of the result; root of the trace, as in a result.
+        reference_sigma_deg, reference_sigma_mm: of the reference; zero for one that counts as exact.
     """
 
     head_point_error_px: dict[str, dict[str, float]] | None
-    rotation_error_deg: float | None
-    translation_error_mm: float | None
-    error_sigmas: float | None
+    rotation_error_deg: float | None = None
+    translation_error_mm: float | None = None
+    error_sigmas: float | None = None
+    result_sigma_deg: float | None = None
+    result_sigma_mm: float | None = None
+    reference_sigma_deg: float | None = None
+    reference_sigma_mm: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
         return dict(vars(self))
@@ -46,9 +65,15 @@ class Evaluation:
         if self.rotation_error_deg is not None and self.translation_error_mm is not None:
             rows.append(("rotation error", f"{self.rotation_error_deg:.3f} deg"))
             rows.append(("translation error", f"{self.translation_error_mm:.3f} mm"))
+        if self.result_sigma_deg is not None and self.result_sigma_mm is not None:
+            rows.append(("1 sigma of the result", f"{self.result_sigma_deg:.3f} deg, {self.result_sigma_mm:.3f} mm"))
+        if self.reference_sigma_deg is not None and self.reference_sigma_mm is not None:
+            sigma = f"{self.reference_sigma_deg:.3f} deg, {self.reference_sigma_mm:.3f} mm"
+            is_exact = not self.reference_sigma_deg and not self.reference_sigma_mm
+            rows.append(("1 sigma of the reference", "none stated: it counts as exact" if is_exact else sigma))
         if self.error_sigmas is not None:
             bound = f"{CHI_3_SIGMA:.2f} is the 3 sigma bound of 6 unknowns"
-            rows.append(("error in its own sigmas", f"{self.error_sigmas:.2f} ({bound})"))
+            rows.append(("error in sigmas of both", f"{self.error_sigmas:.2f} ({bound})"))
         return rows or [("nothing to compare with", "no head_points.csv, no truth")]
 
 
@@ -59,12 +84,14 @@ CHI_3_SIGMA = 4.4876
 def evaluate(
     result: CalibrationResult, recording: Recording | str | Path, truth: str | Path | None = None
 ) -> Evaluation:
-    """Measure a result against the recording's head points and against a truth.
+    """Measure a result against the recording's head points and against a reference.
+
+    The clock, the joint offsets and the RCM offset that the calibration found are applied, as it applied them itself.
 
     Args:
         result: what is measured.
         recording: the recording, or its folder.
-        truth: YAML file with `camera_right_T_arm` (4x4 rows, mm); default: the recording's ground_truth.yaml, if any.
+        truth: a file as `read_reference` takes it; default: the recording's ground_truth.yaml, if any.
     Raises:
         InputError: the result has no transform, or a file breaks its format.
     """
@@ -72,13 +99,11 @@ def evaluate(
         raise InputError(where="result", expected="a transform to evaluate", found=f"status {result.status}")
     opened = load_recording(recording) if isinstance(recording, (str, Path)) else recording
     beside = opened.path / "ground_truth.yaml"
-    rotation_deg, translation_mm, sigmas = None, None, None
-    if truth is not None or beside.is_file():
-        rotation_deg, translation_mm, sigmas = _errors(
-            result.camera_right_T_arm.matrix, result.covariance, read_transform(Path(truth or beside))
-        )
-    errors = head_point_errors(result, opened, motion_poses(opened))
-    return Evaluation(summarise_head_points(errors), rotation_deg, translation_mm, sigmas)
+    errors = head_point_errors(result, opened, poses_at(opened, result.kinematic_offsets))
+    measured = Evaluation(summarise_head_points(errors))
+    if truth is None and not beside.is_file():
+        return measured
+    return _compared(measured, result, read_reference(Path(truth or beside)))
 
 
 def head_point_errors(
@@ -118,35 +143,88 @@ def summarise_head_points(errors: dict[str, np.ndarray] | None) -> dict[str, dic
     return summary or None
 
 
-def read_transform(path: Path) -> RigidTransform:
-    """`camera_right_T_arm` of a YAML file (4x4 rows, mm) or of a result.json.
+def read_reference(path: Path) -> Reference:
+    """A reference from a YAML file (`camera_right_T_arm`, 4x4 rows, mm) or from a result.json.
+
+    Its uncertainty, where it has any: `covariance` (6x6 rows, rotation first, rad and mm: R = exp(dphi) R^ in the
+    camera frame, t = t^ + dt), or `sigma_deg` and `sigma_mm`, 1 sigma of each axis.
 
     Raises:
         FileError: the file cannot be read.
-        InputError: it holds no such transform.
+        InputError: it holds no such transform, or an uncertainty that cannot be one.
     """
     raw = load_yaml(path, error=InputError)
     if "camera_right_T_arm" not in raw:
         raise InputError(where=str(path), expected="a key camera_right_T_arm", found=", ".join(raw))
     rows = raw["camera_right_T_arm"]
+    where = f"{path}: camera_right_T_arm"
+    numbers = _numbers(rows["matrix"] if isinstance(rows, dict) and "matrix" in rows else rows, (4, 4), where)
+    matrix = rigid_from_text(numbers.tolist(), where, InputError, no_note)
+    transform = RigidTransform("camera_right", "arm", torch.from_numpy(matrix))
+    return Reference(transform, _reference_covariance(raw, path))
+
+
+def _reference_covariance(raw: dict[str, Any], path: Path) -> np.ndarray | None:
+    if raw.get("covariance") is not None:
+        C = _numbers(raw["covariance"], (6, 6), f"{path}: covariance")
+        scale = np.sqrt(np.abs(np.diag(C)).clip(1e-300))
+        unit = C / np.outer(scale, scale)
+        if np.abs(unit - unit.T).max() > 1e-6 or np.linalg.eigvalsh(0.5 * (unit + unit.T)).min() < -1e-9:
+            expected = "a symmetric matrix without a negative eigenvalue"
+            raise InputError(where=f"{path}: covariance", expected=expected, found="another one")
+        return 0.5 * (C + C.T)
+    stated = {key: raw[key] for key in ("sigma_deg", "sigma_mm") if raw.get(key) is not None}
+    if not stated:
+        return None
+    if len(stated) == 1:
+        raise InputError(
+            where=str(path), expected="sigma_deg and sigma_mm together", found=f"only {next(iter(stated))}"
+        )
+    for key, value in stated.items():
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < math.inf:
+            raise InputError(where=f"{path}: {key}", expected="a positive number", found=repr(value))
+    turn, shift = math.radians(stated["sigma_deg"]), float(stated["sigma_mm"])
+    return np.diag([turn**2] * 3 + [shift**2] * 3)
+
+
+def _numbers(value: Any, shape: tuple[int, int], where: str) -> np.ndarray:
     try:
-        matrix = torch.tensor(rows["matrix"] if isinstance(rows, dict) else rows, dtype=torch.float64)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(where=f"{path}: camera_right_T_arm", expected="4x4 rows", found=str(error)) from error
-    return RigidTransform("camera_right", "arm", matrix)
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.empty(0)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise InputError(where=where, expected=f"{shape[0]}x{shape[1]} rows of finite numbers", found="something else")
+    return array
 
 
-def _errors(
-    found: Float[Tensor, "4 4"], covariance: np.ndarray | None, truth: RigidTransform
-) -> tuple[float, float, float | None]:
-    """Rotation error (deg), translation error (mm), and both in units of the result's own covariance."""
+def _compared(measured: Evaluation, result: CalibrationResult, reference: Reference) -> Evaluation:
+    """The evaluation with the distance to a reference, in deg, mm, and units of both covariances."""
+    found, truth = result.camera_right_T_arm, reference.camera_right_T_arm
+    if found is None:
+        return measured
     # R_true = exp(dphi) R_found and t_true = t_found + dt: the perturbation that the covariance describes.
-    dphi = matrix_to_rotvec(truth.R @ rigid_inverse(found)[..., :3, :3])
-    dt = truth.t - found[..., :3, 3]
-    sigmas = None
-    if covariance is not None:
-        # Scaled to unit variances: radians and millimetres, and directions that are hardly known, differ by 1e12.
-        scale = np.sqrt(np.diag(covariance))
-        error = np.concatenate([dphi.numpy(), dt.numpy()]) / scale
-        sigmas = math.sqrt(error @ np.linalg.pinv(covariance / np.outer(scale, scale), hermitian=True) @ error)
-    return math.degrees(float(dphi.norm())), float(dt.norm()), sigmas
+    dphi = matrix_to_rotvec(truth.R @ rigid_inverse(found.matrix)[..., :3, :3])
+    dt = truth.t - found.t
+    error = np.concatenate([dphi.numpy(), dt.numpy()])
+    both = [C for C in (result.covariance, reference.covariance) if C is not None]
+    own_C, other_C = result.covariance, np.zeros((6, 6)) if reference.covariance is None else reference.covariance
+    return replace(
+        measured,
+        rotation_error_deg=math.degrees(float(dphi.norm())),
+        translation_error_mm=float(dt.norm()),
+        error_sigmas=mahalanobis(error, np.sum(both, axis=0)) if own_C is not None else None,
+        result_sigma_deg=result.rotation_sigma_deg,
+        result_sigma_mm=result.translation_sigma_mm,
+        reference_sigma_deg=math.degrees(math.sqrt(np.trace(other_C[:3, :3]))),
+        reference_sigma_mm=math.sqrt(np.trace(other_C[3:, 3:])),
+    )
+
+
+def mahalanobis(error: np.ndarray, covariance: np.ndarray) -> float:
+    """sqrt(e^T C^-1 e) of a (6,) error, rotation first, rad and mm.
+
+    Scaled to unit variances: radians and millimetres, and directions that are hardly known, differ by 1e12.
+    """
+    scale = np.sqrt(np.diag(covariance))
+    unit = error / scale
+    return math.sqrt(unit @ np.linalg.pinv(covariance / np.outer(scale, scale), hermitian=True) @ unit)

@@ -11,8 +11,10 @@ from rmis_calib.geometry.rigid import rigid_inverse
 from rmis_calib.io import Recording
 from rmis_calib.io.observations import CLOCK
 from rmis_calib.kinematics import RobotKinematics
-from rmis_calib.pipeline.poses import MotionPoses
+from rmis_calib.pipeline.poses import MotionPoses, motion_poses
+from rmis_calib.results import KinematicOffsets
 from rmis_calib.solver import Problem, Solution
+from rmis_calib.solver.model.residuals import rcm_axes
 from rmis_calib.solver.settings import UnknownSettings
 
 _STEP = {"rad": 1e-5, "mm": 1e-3}
@@ -35,6 +37,33 @@ def estimated_offsets(solution: Solution, columns: tuple[str, ...], like: Tensor
     found = {name: nuisance.value.reshape(-1) for name, nuisance in solution.nuisances.items()}
     joint_offset = found.get("joint_offset", like.new_zeros(len(columns)))
     return joint_offset, float(found["clock"]) if "clock" in found else 0.0
+
+
+def poses_at(recording: Recording, offsets: KinematicOffsets, device: str = "cpu") -> MotionPoses:
+    """Poses of the motions with the offsets that a calibration found: what every prediction from a result starts from.
+
+    Motions whose time the joint log does not cover at that clock are left out.
+    """
+    poses = motion_poses(recording, device)
+    if offsets.clock_s or any(offsets.joints.values()):
+        unknowns = KinematicUnknowns(recording, poses.frames, device)
+        values = [offsets.joints.get(column, 0.0) for column in unknowns.columns]
+        joint_offset = torch.tensor(values, dtype=torch.float64, device=device)
+        poses, known = unknowns.motion_poses(poses.frames, joint_offset, offsets.clock_s)
+        poses = poses.select(known)
+    return with_rcm_offset(poses, offsets.rcm_mm)
+
+
+def with_rcm_offset(poses: MotionPoses, rcm_mm: tuple[float, float]) -> MotionPoses:
+    """The poses with the shaft's axis moved off the nominal RCM, along the directions of `residuals.rcm_axes`."""
+    if not any(rcm_mm):
+        return poses
+    arm_R_rcm = poses.arm_T_rcm[:, :3, :3]
+    arm_v = (arm_R_rcm @ poses.rcm_v_axis[..., None])[..., 0]
+    first, second = rcm_axes(arm_R_rcm.permute(1, 2, 0), arm_v.T)
+    arm_T_rcm = poses.arm_T_rcm.clone()
+    arm_T_rcm[:, :3, 3] += (rcm_mm[0] * first + rcm_mm[1] * second).T
+    return replace(poses, arm_T_rcm=arm_T_rcm)
 
 
 class KinematicUnknowns:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rmis_calib.errors import RobotError
@@ -33,6 +33,11 @@ class MotionPoses:
     rcm_v_axis: Float[Tensor, "m 3"]
     rcm_s_end_mm: Float[Tensor, " m"]
     rcm_p_head: Float[Tensor, "m 3"]
+
+    def select(self, which: Bool[Tensor, " m"]) -> "MotionPoses":
+        """The poses of some motions."""
+        tensors = {name: value[which] for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return MotionPoses(frames=self.frames[which.cpu().numpy()], **tensors)
 
 
 def motion_poses(recording: Recording, device: str = "cpu") -> MotionPoses:

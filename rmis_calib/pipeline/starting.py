@@ -10,7 +10,7 @@ from rmis_calib.errors import InputError
 from rmis_calib.geometry import RigidTransform
 from rmis_calib.io import Recording
 from rmis_calib.pipeline.choosing import Choice, consistent_choice, first_choice, pointed_at
-from rmis_calib.pipeline.evaluation import read_transform
+from rmis_calib.pipeline.evaluation import read_reference
 from rmis_calib.pipeline.observing import predict_contours, select_frames
 from rmis_calib.pipeline.poses import MotionPoses
 from rmis_calib.vision import ShaftDetections
@@ -26,7 +26,7 @@ def read_prior(config: CalibrationConfig) -> RigidTransform | None:
     Raises:
         FileError, InputError: `config.prior` holds no transform.
     """
-    return None if config.prior is None else read_transform(Path(config.prior))
+    return None if config.prior is None else read_reference(Path(config.prior)).camera_right_T_arm
 
 
 def first_choices(

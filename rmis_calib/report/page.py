@@ -7,6 +7,7 @@ from types import MappingProxyType
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from rmis_calib.io.atomic import atomic_write
+from rmis_calib.io.outputs import check_file, is_report
 from rmis_calib.report import content, evidence
 from rmis_calib.report.overlays import DETECTED_RGB, PREDICTED_RGB, Overlay, embed
 from rmis_calib.results import CalibrationResult
@@ -23,7 +24,7 @@ def write_report(
     source: str,
     notes: Mapping[str, str] = _NO_NOTES,
 ) -> None:
-    """Write the report of a calibration, whole or not at all.
+    """Write the report of a calibration, whole or not at all; an earlier report there is replaced.
 
     The page loads nothing: pictures and plots are inside it. Every text is escaped. A result that failed its checks is
     shown as one: its transform, where there is one, is marked as not for use and is not offered for copying.
@@ -37,8 +38,9 @@ def write_report(
         notes: further lines for the head of the page, such as errors against a known truth.
 
     Raises:
-        OutputError: the file cannot be written.
+        OutputError: another file is there, or it cannot be written.
     """
+    check_file(Path(path), is_report, overwrite=True)
     page = render_report(result, overlays, title=title, source=source, notes=notes)
     with atomic_write(path) as temporary:
         temporary.write_text(page, encoding="utf-8")

@@ -168,20 +168,32 @@ def test_output_below_a_file_cannot_be_written(recording, tmp_path, capsys):
     [
         ([], "usage"),
         (["calibrat"], "unknown command"),
-        (["calibrate"], "required"),
+        (["calibrate"], "expected PATH, found nothing"),
         (["calibrate", "nowhere", "--out", "o"], "nowhere"),
-        (["calibrate", "nowhere", "--out", "o", "--methode", "joint"], "--method"),
-        (["calibrate", "nowhere", "--out", "o", "--method", "magic"], "magic"),
+        (["calibrate", "nowhere", "--out", "o", "--methode", "joint"], "found --methode (did you mean --method?)"),
+        (["calibrate", "nowhere", "--method", "magic"], "--method: expected one of global, joint, paper, found magic"),
         (["calibrate", "nowhere", "--out", "o", "--config", "absent.yaml"], "absent.yaml"),
         (
             ["detect", "nowhere", "--out", "o", "--every", "0"],
-            "every: expected Value error, must be at least 1, found 0",
+            "every: expected 1 or more, found 0",
         ),
         (["calibrate", "nowhere", "--out", "o", "--edge-bias-px", "-1"], "edge_bias_px"),
         (["solve", "absent.npz", "--out", "o.json"], "absent.npz"),
         (["evaluate", "absent.json", "nowhere"], "absent.json"),
         (["detect", "absent.mp4", "--out", "o"], "absent.mp4"),
         (["synth", "o", "--preset", "no-such-preset"], "no-such-preset"),
+        (["synth", "o", "--motions", "0"], "motions: expected 1 or more, found 0"),
+        (["calibarte"], "did you mean calibrate?"),
+        (["calibrate", "nowhere", "--every"], "--every: expected a value after it"),
+        (["calibrate", "nowhere", "--every", "two"], "--every: expected INT, found two"),
+        (
+            ["calibrate", "nowhere", "--solver.noise.image", "-1"],
+            "--solver.noise.image: expected more than 0, found -1",
+        ),
+        (["calibrate", "nowhere", "--solver.noise.image", "nan"], "--solver.noise.image: expected a finite number"),
+        (["calibrate", "nowhere", "--instrument-at", "3", "4"], "--instrument-at: expected INT FLOAT FLOAT, found 3 4"),
+        (["solve", "a.npz", "b.npz"], "found 'b.npz', which is one too many"),
+        (["calibrate", "nowhere", "--masks", "absent"], "nowhere"),
     ],
 )
 def test_bad_usage(argv, words, tmp_path, monkeypatch, capsys):
@@ -189,6 +201,9 @@ def test_bad_usage(argv, words, tmp_path, monkeypatch, capsys):
     assert main(argv) == 2
     captured = capsys.readouterr()
     assert words in captured.out + captured.err
+    if argv:  # one line, in our words
+        assert captured.err.count("\n") == 1 and captured.err.startswith("rmis-calib: error: ")
+        assert not any(alien in captured.err for alien in ("pydantic", "http", "Value error", "Input should", "╭"))
     assert list(tmp_path.iterdir()) == []
 
 

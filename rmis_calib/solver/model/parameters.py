@@ -225,7 +225,7 @@ def _displaced(name: str, linear: LinearisedRows, measured: MeasurementRows, sta
     """Columns of the unknowns that move the shaft in `arm`."""
     R = batch_last(state.R, 2)[..., None]
     if name == "rcm_offset":
-        return torch.stack([dot(linear.w, rotate(R, e)[:, None]) for e in rcm_axes(measured)])
+        return torch.stack([dot(linear.w, rotate(R, e)[:, None]) for e in rcm_axes(measured.R, measured.v)])
     if measured.joint is not None and name == "joint_offset":
         return torch.stack([_effect(linear, R, motion) for motion in measured.joint.unbind(1)])
     if measured.clock is not None and name == "clock":

@@ -160,18 +160,24 @@ def camera_poses(measured: MeasurementRows, state: State) -> tuple[Float[Tensor,
     return R, t
 
 
-def rcm_axes(measured: MeasurementRows) -> tuple[Float[Tensor, "3 b n"], Float[Tensor, "3 b n"]]:
+def rcm_axes(
+    R: Float[Tensor, "3 3 ..."], v: Float[Tensor, "3 ..."]
+) -> tuple[Float[Tensor, "3 ..."], Float[Tensor, "3 ..."]]:
     """Two unit directions across the shaft, fixed to `rcm`, in `arm`: the axis of `rcm` that follows the one nearest to
     the shaft (x, y, z, x) made perpendicular to it, and the shaft times that.
 
     The offset is one constant only while the choice stays the same: while the shaft keeps within 45 degrees of one
     axis. (To compare the two axes that lie across the shaft instead changes the choice from motion to motion.)
+
+    Args:
+        R: `arm_R_rcm`.
+        v: direction of the shaft, in `arm`.
     """
-    along = torch.stack([dot(measured.R[:, i], measured.v).abs() for i in range(3)])
+    along = torch.stack([dot(R[:, i], v).abs() for i in range(3)])
     nearest = along.argmax(0)
-    axis = torch.where(nearest == 2, measured.R[:, 0], torch.where(nearest == 0, measured.R[:, 1], measured.R[:, 2]))
-    e1 = unit(axis - dot(axis, measured.v) * measured.v)
-    return e1, cross(measured.v, e1)
+    axis = torch.where(nearest == 2, R[:, 0], torch.where(nearest == 0, R[:, 1], R[:, 2]))
+    e1 = unit(axis - dot(axis, v) * v)
+    return e1, cross(v, e1)
 
 
 def predict_shaft(measured: MeasurementRows, state: State) -> Shaft:
@@ -193,7 +199,7 @@ def _corrected(measured: MeasurementRows, state: State) -> tuple[Tensor, Tensor,
     """RCM, direction and head vector in `arm` with the estimated offsets applied, to first order in the rotation."""
     p, v, head = measured.p, measured.v, measured.head
     if bool((state.rcm_offset != 0).any()):
-        e1, e2 = rcm_axes(measured)
+        e1, e2 = rcm_axes(measured.R, measured.v)
         p = p + state.rcm_offset[:, 0, None] * e1 + state.rcm_offset[:, 1, None] * e2
     displacement = None
     if measured.joint is not None and bool((state.joint_offset != 0).any()):

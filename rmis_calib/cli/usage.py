@@ -1,0 +1,100 @@
+"""Arguments parsed by tyro, and what is wrong with them in one line of our words."""
+
+import contextlib
+import io
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import tyro
+from pydantic import ValidationError
+
+from rmis_calib.config import config_error
+from rmis_calib.errors import ConfigError, InputError
+from rmis_calib.io.configs import did_you_mean
+from rmis_calib.io.validation import expectation
+
+_FLAG = re.compile(r"(--[a-z][a-z0-9.-]*)")
+
+
+def parse_arguments(kind: type, argv: Sequence[str], prog: str, default: Any = None) -> Any:
+    """An instance of the dataclass `kind` from command-line words.
+
+    Raises:
+        SystemExit: help was asked for, and printed.
+        InputError: a word that is not understood, a value that cannot be, or something missing.
+    """
+    printed = io.StringIO()
+    try:
+        # Help goes to standard output; what is wrong with the usage is caught, to be said in one line.
+        with contextlib.redirect_stderr(printed):
+            return tyro.cli(kind, args=list(argv), prog=prog, default=default, description=kind.__doc__)
+    except ValidationError as error:  # of the settings as a whole; tyro reports those of single groups itself
+        raise config_error(error, prog) from None
+    except SystemExit as request:
+        if not request.code:
+            raise
+        raise _in_our_words(_unboxed(printed.getvalue()), argv, prog) from None
+
+
+def _unboxed(text: str) -> list[str]:
+    """Lines of a box drawn around text, without the box."""
+    lines = (re.sub(r"\x1b\[[0-9;]*m", "", line).strip("│╭╮╰╯ ").rstrip() for line in text.splitlines())
+    return [line for line in lines if line.strip("─ ")]
+
+
+def _in_our_words(lines: list[str], argv: Sequence[str], prog: str) -> InputError:
+    """The complaint that the lines hold; with a hint at the help where nothing better is known."""
+    text = " ".join(line.strip() for line in lines)
+    help_hint = f"{prog} --help lists them"
+    if "Unrecognized options" in text:
+        unknown = next((word for word in argv if word.startswith("-") and word.split("=")[0] in text), None)
+        known = _FLAG.findall(text.partition("Perhaps you meant")[2])
+        if unknown is None:
+            extra = text.partition("Unrecognized options:")[2].split()[0].strip(",")
+            return InputError(where=prog, expected="one argument less", found=f"{extra!r}, which is one too many")
+        word = unknown.split("=")[0]
+        near = did_you_mean(word, known) or (f" (did you mean {known[0]}?)" if known else f" ({help_hint})")
+        return InputError(where=prog, expected="a known option", found=f"{word}{near}")
+    if "Missing from" in text or "Required options" in text:
+        missing = [line.strip() for line in lines if re.fullmatch(r"\s*(--[a-z.-]+ )?[A-Z|]+", line)]
+        return InputError(where=prog, expected=", ".join(missing) or "more arguments", found=f"nothing ({help_hint})")
+    choice = re.search(r"invalid choice '(.*?)' for argument '(.*?)'\. Expected one of \((.*?)\)", text)
+    if choice:
+        options = [option.strip(" '") for option in choice[3].split(",") if option.strip(" '") not in ("", "None")]
+        near = did_you_mean(choice[1], options)
+        return InputError(where=choice[2], expected=f"one of {', '.join(sorted(options))}", found=f"{choice[1]}{near}")
+    missing_value = re.search(r"Missing value for argument '(.*?)'", text)
+    if missing_value:
+        return InputError(where=missing_value[1], expected="a value after it", found="nothing")
+    nested = re.search(r"Error parsing settings\.?([\w.]*): \d+ validation errors? for \w+ (\w+) .*?type=(\w+)", text)
+    if nested:
+        value = re.search(r"input_value=(.*?), input_type", text)
+        bound = re.search(r"(?:than or equal to|than|equal to) (-?[\d.e+-]+)", text)
+        expected = expectation(nested[3], {"bound": bound[1].rstrip(".")} if bound else {})
+        where = ".".join(part for part in (nested[1], nested[2]) if part)
+        return ConfigError(
+            where=f"--{where.replace('_', '-')}", expected=expected, found=value[1] if value else "another"
+        )
+    parsing = re.search(r"Error parsing (--[\w.-]+)", text)
+    if parsing:
+        flag = parsing[1]
+        shape = next((line for line in lines if line.strip().startswith(f"{flag} ")), f"{flag} VALUE")
+        given = _values_after(flag, argv)
+        expected = shape.strip().removeprefix(flag).strip().replace("{None}|", "").strip("{}")
+        return InputError(where=flag, expected=expected, found=" ".join(given) or "nothing")
+    return InputError(where=prog, expected="arguments as in --help", found=text[:200])
+
+
+def _values_after(flag: str, argv: Sequence[str]) -> list[str]:
+    for index, word in enumerate(argv):
+        if word == flag:
+            values = []
+            for value in argv[index + 1 :]:
+                if value.startswith("--"):
+                    break
+                values.append(value)
+            return values
+        if word.startswith(f"{flag}="):
+            return [word.partition("=")[2]]
+    return []
