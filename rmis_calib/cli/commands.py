@@ -14,6 +14,7 @@ from rmis_calib.cli.console import ProgressCallback, console, print_advice, prin
 from rmis_calib.cli.usage import parse_arguments
 from rmis_calib.config import CalibrationConfig, load_config
 from rmis_calib.errors import FileError, InputError, OutputError
+from rmis_calib.io.configs import check_regular
 from rmis_calib.io.folders import DESCRIPTION, recording_folder
 from rmis_calib.io.outputs import (
     EVALUATION_FORMAT,
@@ -159,13 +160,12 @@ class Evaluate:
     """Replace OUT, if it is an evaluation of this program."""
 
     def run(self) -> int:
+        inputs = [path for path in (self.result, self.truth) if path is not None]
+        for path in inputs:
+            check_regular(path)
         recording_folder(self.recording)
         from rmis_calib.io.description import read_description
 
-        inputs = [path for path in (self.result, self.truth) if path is not None]
-        for path in inputs:
-            if not path.is_file():
-                raise FileError(where=str(path), expected="a readable file", found="nothing there")
         description = read_description(self.recording)
         if self.out is not None:
             check_apart(self.out, [*description.inputs, *inputs])
@@ -298,7 +298,8 @@ def setting_inputs(config: str | None, settings: CalibrationConfig) -> list[Path
     """
     for flag, value in (("--masks", settings.masks), ("--prior", settings.prior)):
         if value is not None and not Path(value).exists():
-            raise FileError(where=f"{flag} {value}", expected="a file or folder", found="nothing there")
+            what = {"--masks": "a folder of mask pictures, or a model file", "--prior": "a YAML file or a result.json"}
+            raise FileError(where=value, expected=what[flag], found="nothing there")
     named = [Path(value) for value in (config, settings.masks, settings.prior) if value is not None]
     return [path for path in named if path.exists()]
 

@@ -30,11 +30,20 @@ from rmis_calib.pipeline.estimation import (
     used_motions,
 )
 from rmis_calib.pipeline.evaluation import head_point_errors, summarise_head_points
+from rmis_calib.pipeline.frozen import about_repeats, repeated_motions, without_frames
 from rmis_calib.pipeline.kinematic_unknowns import (
     KinematicUnknowns,
     estimated_offsets,
     poses_at,
+    poses_at_motions,
     with_rcm_offset,
+)
+from rmis_calib.pipeline.misfit import (
+    is_misfit,
+    joined_residuals,
+    likely_causes,
+    misfit_message,
+    signed_residuals,
 )
 from rmis_calib.pipeline.next_motion import (
     advice_record,
@@ -53,12 +62,14 @@ from rmis_calib.pipeline.observing import (
 from rmis_calib.pipeline.poses import MotionPoses, motion_poses
 from rmis_calib.pipeline.starting import first_choices, read_prior
 from rmis_calib.results import STATUS_SENTENCES, CalibrationResult, Motions
-from rmis_calib.solver import Solution
-from rmis_calib.vision import ShaftDetections
+from rmis_calib.solver import Solution, SolveStatus
+from rmis_calib.vision import FrameReason, ShaftDetections
 from rmis_calib.vision.masks import Segmenter
 
 JOINTS_UNKNOWN = "the joint log does not cover this time"
 TOO_FEW = "usable, but there are too few"
+VELOCITY_STEP_S = 0.01
+"""Time from which the velocity of the shaft in the picture is told."""
 CHOICE_ROUNDS = 3
 """Solves at most: a choice of candidates that has not settled by then alternates between equals."""
 
@@ -156,6 +167,7 @@ def run_calibration(
     prior = read_prior(config)
     poses = motion_poses(recording, config.device)
     views = detect_recording(recording, config, progress, segment=segment)
+    views, notes = _without_repeats(views, poses)
     draft = _without_joint_offsets(config)
     detections = tuple(select_frames(view.detections, poses.frames) for view in views)
     instruments = choices_by_instrument(detections)
@@ -168,8 +180,59 @@ def run_calibration(
         run = _solve_choice(recording, draft, views, poses, better, progress, run.clock_s)
     if draft != config:
         run = _solve_choice(recording, config, views, poses, run.choices, progress, run.clock_s)
-    run = replace(run, result=replace(run.result, notes=recording.notes + run.result.notes))
+    result = _with_misfit_named(run, config)
+    run = replace(run, result=replace(result, notes=recording.notes + notes + result.notes))
     return _advised(run, config)
+
+
+def _with_misfit_named(run: CalibrationRun, config: CalibrationConfig) -> CalibrationResult:
+    """The result; one that is not trustworthy because pictures and joints do not fit says so first, with the causes."""
+    result, solution = run.result, run.solution
+    if solution is None or result.camera_right_T_arm is None or result.trustworthy:
+        return result
+    status = SolveStatus(int(solution.status))
+    if status in (SolveStatus.CONVERGED, SolveStatus.SINGULAR, SolveStatus.NON_FINITE) and not is_misfit(result):
+        return result
+    unknowns = KinematicUnknowns(run.recording, run.poses.frames, config.device)
+    parts = []
+    for view, choice in zip(run.views, run.choices, strict=True):
+        now, later = run.predicted_contours(view), None
+        if unknowns.has_clock and now is not None:
+            at = poses_at_motions(unknowns, run.poses, result.kinematic_offsets, VELOCITY_STEP_S)
+            later = replace(run, poses=at).predicted_contours(view)
+        if now is not None and view.camera is not None:
+            found = select_frames(view.detections, run.poses.frames)
+            parts.append(signed_residuals(found, choice, now, later, VELOCITY_STEP_S, view.camera))
+    repeated = sum(reason == FrameReason.REPEATED.sentence for reason in result.motions.reasons)
+    causes = likely_causes(joined_residuals(parts), _disparity(run), repeated) if parts else []
+    return replace(result, message=misfit_message(result, causes))
+
+
+def _disparity(run: CalibrationRun) -> float | None:
+    """Median of x_left - x_right of the shaft's end, signed by the baseline; negative where the cameras are swapped."""
+    extrinsics = run.recording.stereo.camera_left_T_camera_right
+    if extrinsics is None or len(run.views) < 2:
+        return None
+    middles = []
+    for view, choice in zip(run.views, run.choices, strict=True):
+        found = select_frames(view.detections, run.poses.frames)
+        rows = torch.arange(len(choice.candidate), device=choice.candidate.device)
+        xy = torch.where(found.end_valid[..., None], found.end_xy, torch.nan)[rows, choice.candidate.clamp_min(0)]
+        middles.append(torch.where(choice.taken[:, None], xy, torch.nan)[:, 0].double())
+    gap = (middles[1] - middles[0]) * torch.sign(extrinsics.t[0]).to(middles[0].device)
+    return float(gap.nanmedian()) if bool(torch.isfinite(gap).any()) else None
+
+
+def _without_repeats(views: tuple[View, ...], poses: MotionPoses) -> tuple[tuple[View, ...], tuple[str, ...]]:
+    """The views without pictures that repeat the one before while the joints moved, and a note for each such view."""
+    kept, notes = [], []
+    for view in views:
+        frames = poses.frames[repeated_motions(view.change, poses)]
+        if len(frames):
+            view = replace(view, detections=without_frames(view.detections, frames))
+            notes.append(about_repeats(view.side, frames))
+        kept.append(view)
+    return tuple(kept), tuple(notes)
 
 
 def _surest(runs: list[CalibrationRun]) -> CalibrationRun:

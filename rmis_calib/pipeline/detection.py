@@ -16,6 +16,7 @@ from rmis_calib.config import CalibrationConfig
 from rmis_calib.geometry.cameras import Camera
 from rmis_calib.io import FrameBatch, FrameSource, Recording, load_recording, open_source
 from rmis_calib.pipeline.device import require_device
+from rmis_calib.pipeline.frozen import ChangeMeter
 from rmis_calib.pipeline.masks import MaskReader, open_masks
 from rmis_calib.vision import FrameReason, ShaftDetections, ShaftDetector
 from rmis_calib.vision.masks import Segmenter
@@ -67,12 +68,14 @@ class View:
         source: the frames.
         camera: its intrinsics; None where lines are in pixels.
         detections: candidates of every frame, leading axis N.
+        change: largest change of each picture from the one before, levels of 255; infinite where it was not looked at.
     """
 
     side: str
     source: FrameSource
     camera: Camera | None
     detections: ShaftDetections
+    change: Tensor
 
     @property
     def found(self) -> Tensor:
@@ -172,6 +175,8 @@ def _detect_views(
 ) -> tuple[View, ...]:
     """All cameras at once: their videos are decoded side by side, and the next batches while the last are searched."""
     parts: dict[str, list[ShaftDetections]] = {camera.side: [] for camera in cameras}
+    meters = {camera.side: ChangeMeter() for camera in cameras}
+    changes: dict[str, list[Tensor]] = {camera.side: [] for camera in cameras}
     done = dict.fromkeys(parts, 0)
     wanted = {camera.side: -(-camera.source.count // config.every) for camera in cameras}
     for camera in cameras:
@@ -184,6 +189,7 @@ def _detect_views(
             camera, detector, batch, masks, future = running.popleft()
             found = future.result()
             parts[camera.side].append(found)
+            changes[camera.side].append(meters[camera.side](batch.images))
             watch(DetectedBatch(camera.side, camera.source, camera.times_s, detector, batch, masks, found))
             done[camera.side] += len(batch.indices)
             progress(camera.stage, done[camera.side], wanted[camera.side])
@@ -195,8 +201,13 @@ def _detect_views(
                 finish_one()
         while running:
             finish_one()
-    found = {c.side: _over_all(concatenate(parts[c.side]), c.source.count, config.every) for c in cameras}
-    return tuple(View(c.side, c.source, c.camera, found[c.side]) for c in cameras)
+    views = []
+    for c in cameras:
+        found = _over_all(concatenate(parts[c.side]), c.source.count, config.every)
+        change = torch.full((c.source.count,), torch.inf)
+        change[:: config.every] = torch.cat(changes[c.side]).cpu()
+        views.append(View(c.side, c.source, c.camera, found, change))
+    return tuple(views)
 
 
 def _take_turns(

@@ -54,6 +54,16 @@ def poses_at(recording: Recording, offsets: KinematicOffsets, device: str = "cpu
     return with_rcm_offset(poses, offsets.rcm_mm)
 
 
+def poses_at_motions(
+    unknowns: "KinematicUnknowns", poses: MotionPoses, offsets: KinematicOffsets, later_s: float
+) -> MotionPoses:
+    """Poses of these motions with the offsets that were found, some time later."""
+    values = [offsets.joints.get(column, 0.0) for column in unknowns.columns]
+    joint_offset = torch.tensor(values, dtype=torch.float64, device=poses.arm_T_rcm.device)
+    at, _ = unknowns.motion_poses(poses.frames, joint_offset, offsets.clock_s + later_s)
+    return with_rcm_offset(at, offsets.rcm_mm)
+
+
 def with_rcm_offset(poses: MotionPoses, rcm_mm: tuple[float, float]) -> MotionPoses:
     """The poses with the shaft's axis moved off the nominal RCM, along the directions of `residuals.rcm_axes`."""
     if not any(rcm_mm):

@@ -4,6 +4,7 @@ Joints stay within their limits and near to what the recording shows, since nobo
 stays in the field of view. The estimate that predicts all this is the present one.
 """
 
+import math
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -29,8 +30,6 @@ _PLACES_ALONE, _PLACES_OF_TWO = 9, 5
 """Readings tried of each joint that moves alone, and of each of two that move together."""
 _CHANGED = {"rad": 0.005, "mm": 0.25}
 """A smaller change of a reading is none."""
-_OTHER_MODEL = 1.1
-"""Reported sigma over that of the estimate's own model from which the covariance allows for joint offsets."""
 _PREDICTS = (SolveStatus.CONVERGED, SolveStatus.SINGULAR, SolveStatus.MAX_ITERATIONS, SolveStatus.STALLED)
 """How a solve must have ended for its estimate to predict anything."""
 
@@ -79,7 +78,8 @@ def advice_record(
     if solution.posterior is None:
         return {}
     point = solution.observability.working_point_mm[0]
-    advice = advise(candidates.problem, solution.posterior, point, view, config.solver, candidates.effort)
+    reported = solution.covariance.reshape(6, 6)
+    advice = advise(candidates.problem, solution.posterior, point, view, config.solver, candidates.effort, reported)
     trusted = solution.observability.describe().verdict is Verdict.TRUSTWORTHY
     general = () if trusted else solution.observability.remedies()
     return {
@@ -91,7 +91,7 @@ def advice_record(
 def _sentences(solution: Solution, candidates: Candidates, advice: Advice, where: str) -> list[str]:
     if not len(advice.chosen):
         return [f"The present estimate predicts no motion {where} that would keep the shaft in view."]
-    reported_mm, name = solution.observability.describe().directions[0]
+    _, name = solution.observability.describe().directions[0]
     sigma = [_mm(value) for value in advice.weakest_mm.tolist()]
     out = []
     for step, index in enumerate(advice.chosen.tolist()):
@@ -103,13 +103,14 @@ def _sentences(solution: Solution, candidates: Candidates, advice: Advice, where
             )
         else:
             out.append(f"Then {what}: {sigma[step + 1]} in the weakest direction.")
-    if reported_mm > _OTHER_MODEL * float(advice.weakest_mm[0]):
-        out.append("This counts on encoders without constant offsets; that they may have some is not counted in.")
     return [*out, f"These motions stay {where}, with the shaft in view as far as the present estimate can tell."]
 
 
 def _mm(value: float) -> str:
-    return "more than 1 m" if value > 1e3 else f"{value:.2g} mm" if value < 10.0 else f"{value:.0f} mm"
+    """Two digits, as in the report."""
+    if value > 1e3:
+        return "more than 1 m"
+    return f"{value:.{max(1 - math.floor(math.log10(max(value, 1e-4))), 0)}f} mm"
 
 
 def _values(candidates: Candidates, advice: Advice, step: int) -> dict[str, Any]:

@@ -24,6 +24,7 @@ class FrameReason(IntEnum):
     EDGES_UNCLEAR = 6
     AMBIGUOUS = 7
     LEFT_OUT = 8
+    REPEATED = 9
 
     @property
     def sentence(self) -> str:
@@ -41,6 +42,7 @@ _SENTENCES = {
     FrameReason.EDGES_UNCLEAR: "too few sub-pixel edge points agree on two straight lines",
     FrameReason.AMBIGUOUS: "a strip was found, but its confidence is below the accepted minimum",
     FrameReason.LEFT_OUT: "the frame was left out: only every n-th was to be searched",
+    FrameReason.REPEATED: "the picture repeats the one before although the joints moved",
 }
 
 

@@ -141,11 +141,12 @@ def test_interrupted_and_refused_writing_leaves_nothing_new(tmp_path: Path) -> N
         write_recording(tmp_path / "r", config, on_progress=stop)
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "r").mkdir()
-    for overwrite in (False, True):
-        with pytest.raises(FileExistsError, match="expected a path that does not exist"):
+    (tmp_path / "r" / "recording.yaml").write_text("mine")
+    for overwrite, message in ((False, "a new name, or --overwrite"), (True, "not one with recording.yaml")):
+        with pytest.raises(FileExistsError, match=message):
             write_recording(tmp_path / "r", config, overwrite=overwrite)
     seen = []
-    (tmp_path / "r").rmdir()
+    (tmp_path / "r" / "recording.yaml").unlink()  # an empty folder may be filled
     write_recording(tmp_path / "r", config, on_progress=lambda done, total: seen.append((done, total)))
     assert seen == [(1, 2), (2, 2)]
     assert write_recording(tmp_path / "r", config, overwrite=True).is_dir()

@@ -29,7 +29,8 @@ def test_version(argv, capsys) -> None:
 @pytest.mark.parametrize("argv", [["help"], ["--help"], ["-h"]])
 def test_help_lists_the_commands(argv, capsys) -> None:
     assert main(argv) == 0
-    assert all(name in capsys.readouterr().out for name in COMMANDS)
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in COMMANDS)
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))

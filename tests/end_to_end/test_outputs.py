@@ -155,6 +155,7 @@ def test_whatever_the_command_line_no_foreign_file_is_touched(
     monkeypatch.chdir(dice.choice([path for path in places if path.is_dir()]))
     places += [inputs["recording"], inputs["recording"] / "right.mp4", inputs["npz"], inputs["result"]]
     before = contents(root)
+    del before["in.json"]  # the program wrote it, so that --overwrite may replace it
     commands = [
         ["solve", str(inputs["npz"]), "--method", "paper"],
         ["evaluate", str(inputs["result"]), str(inputs["recording"])],

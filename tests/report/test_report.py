@@ -221,7 +221,8 @@ def test_nothing_is_left_or_replaced_when_writing_fails(
     result_with: MakeResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     target = tmp_path / "report.html"
-    target.write_text("the old page", encoding="utf-8")
+    write_report(target, result_with(), title="the old page", source="s")
+    old = target.read_text(encoding="utf-8")
 
     def full_disk(*_args: object, **_kwargs: object) -> int:
         raise OSError(28, "No space left on device")
@@ -230,7 +231,7 @@ def test_nothing_is_left_or_replaced_when_writing_fails(
     with pytest.raises(OutputError, match="No space left"):
         write_report(target, result_with(), title="t", source="s")
     monkeypatch.undo()
-    assert target.read_text(encoding="utf-8") == "the old page"
+    assert target.read_text(encoding="utf-8") == old
     assert list(tmp_path.iterdir()) == [target]
 
 

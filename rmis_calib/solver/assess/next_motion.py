@@ -32,6 +32,9 @@ outside: it does not count as seen."""
 NEARLY_BEST, NOT_WORSE = 0.1, 1.5
 """Among candidates that miss at most this part of the best gain (in log sigma), and leave at most this many times the
 least sigma, the one of least effort is advised: few joints are easier to move than many."""
+ALIKE_RAD, ALIKE_MM = 0.035, 3.0
+"""Motions that differ by less (2 degrees in the shaft's direction; place of the RCM, and along the shaft) are one: only
+one of them is advised."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +42,9 @@ class Advice:
     """Candidate motions and what they would leave of the uncertainty.
 
     Attributes:
-        chosen: the motions to add, in this order; empty when none keeps the shaft in view.
-        weakest_mm: 1 sigma of the weakest direction, mm at the working point: now, then after each chosen motion.
+        chosen: the motions to add, in this order, no two alike; empty when none keeps the shaft in view.
+        weakest_mm: 1 sigma of the weakest direction, mm at the working point: now, then after each chosen motion. What
+            the reported covariance allows for beside the model (joint offsets) stays in it.
         point_mm: predicted error at the working point, likewise.
         alone_mm: 1 sigma of the weakest direction after adding one candidate alone; infinite where it is out of view.
         visible: whether each candidate would be in view.
@@ -82,6 +86,7 @@ def advise(
     view: Float[Tensor, "c 4"],
     settings: SolverSettings,
     effort: Int[Tensor, " m"] | None = None,
+    reported: Float[Tensor, "6 6"] | None = None,
 ) -> Advice:
     """The motions that would shrink the uncertainty most.
 
@@ -93,18 +98,22 @@ def advise(
         view: least x, least y, greatest x, greatest y in each camera's picture, normalised units.
         settings: as in the estimate.
         effort: of each candidate; less is advised where it is nearly as good.
+        reported: covariance of the transform as the result states it; default: that of the posterior alone.
     """
     state = posterior.state
     A = working_point_jacobian(state.t[0], working_point_mm, settings.verdict.lever_mm)
 
+    information = posterior.information[0]
+    allowance = torch.zeros_like(A) if reported is None else A @ (reported - inverse(information)[:6, :6]) @ A.mT
+
     def left(information: Float[Tensor, "*m p p"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Trace, weakest sigma and sigma at the working point."""
+        """Trace by the model alone; weakest sigma and sigma at the working point with the allowance."""
         C = A @ inverse(information)[..., :6, :6] @ A.mT
+        trace, C = C.diagonal(dim1=-2, dim2=-1).sum(-1), C + allowance
         weakest = torch.linalg.eigvalsh(C)[..., -1].clamp_min(0.0).sqrt()
         at_point = C[..., 3:, 3:].diagonal(dim1=-2, dim2=-1).sum(-1).clamp_min(0.0).sqrt()
-        return C.diagonal(dim1=-2, dim2=-1).sum(-1), weakest, at_point
+        return trace, weakest, at_point
 
-    information = posterior.information[0]
     before, *now = left(information)
     view = _narrowed(view, now[1] / torch.linalg.vector_norm(working_point_mm))
     each, seen = [], []
@@ -116,9 +125,12 @@ def advise(
     gain, visible = torch.cat(each), torch.cat(seen)
     chosen, path = [], [now]
     alone = torch.full_like(gain[:, 0, 0], torch.inf)
-    for step in range(settings.advice.motions if bool(visible.any()) else 0):
+    open_ = visible
+    for step in range(settings.advice.motions):
+        if not bool(open_.any()):
+            break
         trace, weakest, at_point = left(information + gain)
-        trace = torch.where(visible, trace, torch.inf)
+        trace = torch.where(open_, trace, torch.inf)
         if step == 0:
             alone = torch.where(visible, weakest, torch.inf)
         best = _least_effort(before, trace, effort)
@@ -126,6 +138,7 @@ def advise(
         chosen.append(best)
         path.append([weakest[best], at_point[best]])
         information = information + gain[best]
+        open_ = open_ & ~_alike(candidates, best)
     path = torch.stack([torch.stack(pair) for pair in path])
     return Advice(
         chosen=torch.tensor(chosen, dtype=torch.int64),
@@ -134,6 +147,16 @@ def advise(
         alone_mm=alone,
         visible=visible,
     )
+
+
+def _alike(candidates: Problem, index: int) -> Bool[Tensor, " m"]:
+    """Which candidates are the same motion as one of them, to anybody who moves the arms."""
+    T, v, s = candidates.arm_T_rcm[0], candidates.rcm_v_axis[0], candidates.rcm_s_end_mm[0]
+    d = (T[:, :3, :3] @ v[..., None])[..., 0]
+    cosine = (d @ d[index]).clamp(-1.0, 1.0)
+    near = (T[:, :3, 3] - T[index, :3, 3]).norm(dim=-1) < ALIKE_MM
+    along = torch.nan_to_num(s - s[index]).abs() < ALIKE_MM
+    return (cosine.acos() < ALIKE_RAD) & near & along
 
 
 def _narrowed(view: Float[Tensor, "c 4"], sigma: Float[Tensor, ""]) -> Float[Tensor, "c 4"]:

@@ -1,0 +1,162 @@
+"""Why pictures and joints do not fit each other: likely causes, in the order of what the residuals say.
+
+A model that does not fit shows as noise larger than any robot's and camera's. Told as weak motion ("the laparoscope did
+not move") it would send people to record again what is wrong in a file.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rmis_calib.geometry.cameras import Camera
+from rmis_calib.pipeline.choosing import Choice
+from rmis_calib.pipeline.observing import ANOTHER_INSTRUMENT
+from rmis_calib.results import CalibrationResult
+from rmis_calib.solver import MotionReason
+from rmis_calib.vision import ShaftDetections
+
+_MM, _RAD, _LINE = "noise kinematics_mm", "noise kinematics_rad", "noise line"
+TOO_NOISY = {_MM: 2.0, _RAD: 0.012, _LINE: 6.0}
+"""Estimated levels beyond those of robots and pictures that are used as they should be: mm, rad (0.7 deg), and times
+the nominal noise of a line."""
+_CONTRADICTS = (MotionReason.OUTLIER.sentence, ANOTHER_INSTRUMENT)
+EXPLAINS = 0.2
+"""Share of the residuals' variance from which something is named as a cause."""
+_LEAST = 8
+"""Fewest motions that causes are told from."""
+
+
+def misfit_message(result: CalibrationResult, causes: list[str]) -> str:
+    """The result's message with the misfit first, its likely causes, and only then what else was to be said."""
+    levels = {name: result.nuisances.get(name, {}).get("value") for name in TOO_NOISY}
+    mm, rad = levels[_MM], levels[_RAD]
+    size = f" (as if the joints were noisy by {mm:.2g} mm and {np.rad2deg(rad):.2g} deg)" if mm and rad else ""
+    likely = "; then: ".join(causes)
+    head, _, rest = result.message.partition(": ")
+    rest = rest.partition(": are the cameras swapped")[0]
+    return f"{head}: pictures and joints do not fit each other{size}. Likely: {likely}. ({rest})"
+
+
+@dataclass(frozen=True)
+class SignedResiduals:
+    """Lateral distance of the measured axis from the predicted one, one entry a motion and camera.
+
+    Attributes:
+        px: signed, positive right of the predicted line.
+        velocity_px_s: of the predicted line across itself; NaN where the joints' velocity is not known.
+        uv: (n, 2) where it was measured, from the principal point, in focal lengths.
+    """
+
+    px: Float[np.ndarray, " n"]
+    velocity_px_s: Float[np.ndarray, " n"]
+    uv: Float[np.ndarray, "n 2"]
+
+
+def is_misfit(result: CalibrationResult) -> bool:
+    """Whether the noise that explains the residuals is no noise of a robot and a camera, or most motions contradict."""
+    levels = {name: result.nuisances.get(name, {}).get("value") for name in TOO_NOISY}
+    if any(value is not None and value > TOO_NOISY[name] for name, value in levels.items()):
+        return True
+    contradicting = sum(reason in _CONTRADICTS for reason in result.motions.reasons)
+    return contradicting > result.motions.used.sum()
+
+
+def likely_causes(residuals: SignedResiduals, disparity: float | None, repeated: int) -> list[str]:
+    """Causes in words, the most likely first.
+
+    Args:
+        residuals: of all motions and cameras that measured the shaft.
+        disparity: median of x_left - x_right of the same places times the sign of the baseline, normalised units:
+            positive where both cameras are what they are called; None for one camera.
+        repeated: pictures that repeat the one before although the joints moved.
+    """
+    causes = []
+    if repeated:
+        causes.append(f"{repeated} pictures repeat the one before (a grabber that hangs)")
+    if disparity is not None and disparity < 0:
+        causes.append("the left and the right pictures look swapped")
+    u, v = residuals.uv.T
+    by = {
+        "the clock or the frame rate: residuals grow with the speed of the shaft in the picture": (
+            residuals.velocity_px_s[:, None]
+        ),
+        "focal length, crop or lens: residuals depend on the place in the picture": (
+            np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
+        ),
+    }
+    left = residuals.px
+    while by:  # each next cause must explain what those before it leave
+        fits = {words: _explained(left, columns) for words, columns in by.items()}
+        best = max(fits, key=lambda words: fits[words][0])
+        share, left = fits[best]
+        if share <= EXPLAINS:
+            break
+        causes.append(best)
+        del by[best]
+    return causes or ["a joint's sign, unit or order, the base of an arm, or a joint log of another recording"]
+
+
+def signed_residuals(
+    found: ShaftDetections,
+    choice: Choice,
+    predicted: Float[Tensor, "m 2 3"],
+    predicted_later: Float[Tensor, "m 2 3"] | None,
+    later_s: float,
+    camera: Camera,
+) -> SignedResiduals:
+    """Residuals of one camera.
+
+    Args:
+        found: detections of the motions.
+        choice: the candidate that was taken.
+        predicted: contour planes.
+        predicted_later: the same `later_s` later; None where the joints' velocity is not known.
+        later_s: seconds.
+        camera: for its focal length.
+    """
+    rows = torch.arange(len(choice.candidate), device=choice.candidate.device)
+    middle = found.axis_xy[rows, choice.candidate.clamp_min(0)].double().mean(1)  # (m, 2)
+    focal = float(camera.focal)
+    now = _distance(predicted, middle)
+    velocity = torch.full_like(now, torch.nan)
+    if predicted_later is not None:
+        velocity = -(_distance(predicted_later, middle) - now) / later_s
+    taken = (choice.taken & torch.isfinite(now)).cpu().numpy()
+    return SignedResiduals(
+        px=(focal * now).cpu().numpy()[taken],
+        velocity_px_s=(focal * velocity).cpu().numpy()[taken],
+        uv=middle.cpu().numpy()[taken],
+    )
+
+
+def joined_residuals(parts: list[SignedResiduals]) -> SignedResiduals:
+    """Those of all cameras."""
+    return SignedResiduals(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])))
+
+
+def _distance(planes: Float[Tensor, "m 2 3"], xy: Float[Tensor, "m 2"]) -> Float[Tensor, " m"]:
+    """Signed distance of points from the predicted axis, the bisector of both contour planes, in the image."""
+    axis = planes.sum(1)
+    value = axis[:, 0] * xy[:, 0] + axis[:, 1] * xy[:, 1] + axis[:, 2]
+    return value / torch.linalg.vector_norm(axis[:, :2], dim=-1).clamp_min(1e-12)
+
+
+def _explained(values: Float[np.ndarray, " n"], by: Float[np.ndarray, "n k"]) -> tuple[float, Float[np.ndarray, " n"]]:
+    """Share of the variance of values that a linear function explains beyond what chance does (adjusted R^2), and what
+    it leaves of each; nothing is explained where too few are known."""
+    known = np.isfinite(values) & np.isfinite(by).all(1)
+    y, X = values[known], by[known]
+    n, k = X.shape
+    if n < max(_LEAST, 3 * k) or not np.ptp(y):
+        return 0.0, values
+    # A wild motion must not decide: what lies beyond three quartile ranges is drawn in.
+    low, high = np.percentile(y, [25, 75])
+    y = y.clip(low - 3 * (high - low), high + 3 * (high - low))
+    rest = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
+    total = float(((y - (y.mean() if k > 1 else 0.0)) ** 2).mean())
+    left = np.full_like(values, np.nan)
+    left[known] = rest
+    return max(0.0, 1.0 - float((rest**2).mean()) / total * (n - 1) / max(n - k - 1, 1)), left

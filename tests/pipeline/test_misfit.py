@@ -1,0 +1,131 @@
+"""What does not fit is named before weak motion, and its likely causes in the order of the evidence."""
+
+import csv
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+
+import data_synth
+import rmis_calib as rc
+from rmis_calib.config import parse_config
+from rmis_calib.pipeline.misfit import SignedResiduals, likely_causes
+
+N = 120
+CLOCK, PLACE, SWAPPED = "the clock or the frame rate", "focal length, crop or lens", "look swapped"
+
+
+def residuals(seed: int, clock_s: float = 0.0, lens: float = 0.0, noise_px: float = 0.3) -> SignedResiduals:
+    generator = np.random.default_rng(seed)
+    velocity = generator.normal(0.0, 40.0, N)
+    uv = generator.uniform(-0.4, 0.4, (N, 2))
+    px = clock_s * velocity + lens * (uv[:, 0] ** 2 + uv[:, 1] ** 2 - 0.1) + generator.normal(0.0, noise_px, N)
+    return SignedResiduals(px, velocity, uv)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_each_cause_is_told_from_its_trace(seed) -> None:
+    assert likely_causes(residuals(seed, clock_s=0.1), 0.02, 0)[0].startswith(CLOCK)
+    assert likely_causes(residuals(seed, lens=40.0), 0.02, 0)[0].startswith(PLACE)
+    assert SWAPPED in likely_causes(residuals(seed, lens=40.0), -0.02, 0)[0]
+    assert likely_causes(residuals(seed, lens=40.0), 0.02, 7)[0].startswith("7 pictures repeat the one before")
+    (nothing,) = likely_causes(residuals(seed), None, 0)
+    assert nothing.startswith("a joint's sign, unit or order")
+
+
+def test_the_stronger_trace_comes_first() -> None:
+    strong_clock = likely_causes(residuals(0, clock_s=0.2, lens=70.0), None, 0)
+    assert [cause[:9] for cause in strong_clock] == [CLOCK[:9], PLACE[:9]]
+    strong_lens = likely_causes(residuals(0, clock_s=0.03, lens=60.0), None, 0)
+    assert [cause[:9] for cause in strong_lens] == [PLACE[:9]]
+
+
+def test_without_velocities_or_with_a_few_motions_nothing_is_made_up() -> None:
+    few = residuals(0, clock_s=0.1)
+    still = replace(few, velocity_px_s=np.full(N, np.nan))
+    assert likely_causes(still, None, 0)[0].startswith("a joint's sign")
+    short = SignedResiduals(few.px[:5], few.velocity_px_s[:5], few.uv[:5])
+    assert likely_causes(short, None, 0)[0].startswith("a joint's sign")
+
+
+@pytest.fixture(scope="module")
+def smooth(tmp_path_factory):
+    """Continuous pictures of both arms in motion."""
+    config = data_synth.load_synth_config("demo")
+    motion = replace(config.motion, kind="smooth", speed=3.0, joint_rate_hz=200.0)
+    output = replace(config.output, pictures="images")
+    config = replace(config, motions=48, seed=3, motion=motion, output=output)
+    return data_synth.write_recording(tmp_path_factory.mktemp("smooth") / "recording", config)
+
+
+def calibrated(folder, **unknowns):
+    solver = {"unknowns": unknowns, "advice": {"motions": 0}, "bias_correction": False}
+    return rc.calibrate(rc.load_recording(folder), parse_config({"solver": solver}), throw=False)
+
+
+def edited_joints(folder, change) -> None:
+    """Rewrite joints.csv with `change(header, rows)` of its texts."""
+    with (folder / "joints.csv").open(newline="") as file:
+        header, *rows = csv.reader(file)
+    rows = change(header, rows)
+    with (folder / "joints.csv").open("w", newline="") as file:
+        csv.writer(file).writerows([header, *rows])
+
+
+def test_a_wrong_clock_is_called_a_wrong_clock(smooth, tmp_path) -> None:
+    folder = shutil.copytree(smooth, tmp_path / "recording")
+    description = yaml.safe_load((folder / "recording.yaml").read_text())
+    (folder / "recording.yaml").write_text(yaml.safe_dump(description | {"clock_offset_s": 0.35}))
+    result = calibrated(folder, clock=False)
+    assert not result.trustworthy
+    assert "pictures and joints do not fit each other" in result.message and CLOCK in result.message
+    assert "did not move" not in result.message
+
+
+def test_swapped_cameras_are_called_swapped(smooth, tmp_path) -> None:
+    folder = shutil.copytree(smooth, tmp_path / "recording")
+    (folder / "right").rename(folder / "other")
+    (folder / "left").rename(folder / "right")
+    (folder / "other").rename(folder / "left")
+    result = calibrated(folder)
+    assert not result.trustworthy
+    assert result.message.partition("Likely: ")[2].startswith("the left and the right pictures look swapped")
+
+
+def test_a_joint_of_the_wrong_sign_is_a_misfit(smooth, tmp_path) -> None:
+    folder = shutil.copytree(smooth, tmp_path / "recording")
+
+    def turned(header, rows):
+        column = next(i for i, name in enumerate(header) if name.startswith("instrument."))
+        return [[repr(-float(x)) if i == column else x for i, x in enumerate(row)] for row in rows]
+
+    edited_joints(folder, turned)
+    result = calibrated(folder)
+    assert not result.trustworthy and "pictures and joints do not fit each other" in result.message
+
+
+def test_frozen_pictures_are_left_out_and_said(smooth, tmp_path) -> None:
+    folder = shutil.copytree(smooth, tmp_path / "recording")
+    for side in ("right", "left"):
+        files = sorted((folder / side).iterdir())
+        for number in range(16, 34):
+            shutil.copy(files[15], files[number])
+    result = calibrated(folder)
+    reason = "the picture repeats the one before although the joints moved"
+    frozen = [i for i, why in enumerate(result.motions.reasons) if why == reason]
+    assert set(range(19, 34)) <= set(frozen) <= set(range(16, 34))
+    assert not result.motions.used[frozen].any()
+    assert any("pictures repeat the one before although the joints moved (frames " in note for note in result.notes)
+
+
+def test_arms_at_rest_may_show_the_same_picture_again(smooth, tmp_path) -> None:
+    folder = shutil.copytree(smooth, tmp_path / "recording")
+    edited_joints(folder, lambda header, rows: [[row[0], *rows[0][1:]] for row in rows])
+    for side in ("right", "left"):
+        files = sorted((folder / side).iterdir())
+        for path in files[1:]:
+            shutil.copy(files[0], path)
+    result = calibrated(folder)
+    assert not any("repeat" in note for note in result.notes)
