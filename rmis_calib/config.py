@@ -33,6 +33,9 @@ class CalibrationConfig:
     """Masks of one's own in place of the search by colour: a folder of pictures in the order of the frames, white on
     shafts (for stereo two folders below it, `right` and `left`), or a TorchScript (.pt) or ONNX (.onnx) model from
     pictures (b, 3, h, w) in [0, 1] to masks (b, h, w), above 0.5 on shafts."""
+    mask_labels: tuple[int, ...] | None = None
+    """Class numbers of the shaft, where `masks` are pictures of classes (0, 1, 2, ..., as grey values or in a palette):
+    all else is background. Without it, white is shaft."""
     prior: str | None = None
     """A first idea of the answer: a result.json, or a YAML file with camera_right_T_arm (4x4 rows, mm). Of several
     shafts in a picture the one nearest to where it puts the instrument is taken at first; it is no measurement."""

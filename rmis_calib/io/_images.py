@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from rmis_calib.errors import FileError, VideoError
 from rmis_calib.io._depth import bits_of, eight_bits
@@ -59,6 +60,14 @@ class ImageReader:
                 raise VideoError(where=str(self._files[index]), expected=expected, found=found)
             yield image
 
+    def labels(self, indices: Sequence[int]) -> np.ndarray:
+        """(n, h, w) numbers that pictures of classes hold: indices of a palette, else grey values.
+
+        Raises:
+            VideoError: a picture of colours, which number nothing.
+        """
+        return np.stack([_class_numbers(self._files[index]) for index in indices])
+
     def _decode(self, path: Path) -> np.ndarray:
         values = self._values(path)
         return values if values.dtype == np.uint8 else eight_bits(values, self._bits, str(path))
@@ -83,6 +92,21 @@ class ImageReader:
             expected = "pictures of 8 to 16 bits a colour"
             raise VideoError(where=str(path), expected=expected, found=f"{image.dtype} numbers")
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def _class_numbers(path: Path) -> np.ndarray:
+    """(h, w) numbers of one picture."""
+    try:
+        with Image.open(path) as picture:
+            numbers = np.asarray(picture)
+            has_palette = picture.mode == "P"
+    except (OSError, ValueError, Image.DecompressionBombError) as error:
+        raise VideoError(where=str(path), expected="an image", found="a file that cannot be decoded") from error
+    if numbers.ndim == 3 and not has_palette:
+        if np.ptp(numbers[..., :3].astype(np.int64), axis=-1).max() > 0:
+            raise VideoError(where=str(path), expected="grey or palette pictures of class numbers", found="colours")
+        numbers = numbers[..., 0]
+    return numbers.astype(np.int64)
 
 
 def _list_images(folder: Path) -> list[Path]:

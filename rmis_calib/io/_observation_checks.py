@@ -30,6 +30,8 @@ _UNIT_TOLERANCE = 1e-6
 # An image coordinate of 10 is 84 degrees off axis. Points on a line may be far out, so the median decides.
 _MAX_MEDIAN_COORDINATE = 10.0
 _RADIUS_MM = (0.5, 15.0)
+# No detector is off by a twentieth of the focal length (50 px at 1000), and no robot by 4.6 degrees a motion.
+_MAX_SIGMA_IMAGE, _MAX_SIGMA_RAD = 0.05, 0.08
 UNKNOWNS = ("unknown_names", "unknown_displacement", "unknown_at")
 CLOCK = "clock_s"
 """Name of the clock offset among `unknown_names`."""
@@ -134,9 +136,22 @@ def _array(name: str, value: Any, n: int) -> np.ndarray:
         if bad.any():
             found = f"{array[bad][0]:g} at {np.argwhere(bad)[0].tolist()}"
             raise ObservationsError(where=name, expected="positive numbers, or NaN for sigma_image", found=found)
+        if np.isfinite(array).any():
+            _check_sigma(name, float(np.nanmedian(array)))
         return array
     array[~_finite(array)] = np.nan
     return array
+
+
+def _check_sigma(name: str, sigma: float) -> None:
+    """Refuse a sigma whose size says that it is in pixels or degrees."""
+    if name.endswith("_rad") and sigma > _MAX_SIGMA_RAD:
+        hint, expected = "looks like degrees; multiply by pi / 180", f"at most {_MAX_SIGMA_RAD} rad"
+    elif not name.endswith(("_rad", "_mm")) and sigma > _MAX_SIGMA_IMAGE:
+        hint, expected = "looks like pixels; divide by the focal length", f"at most {_MAX_SIGMA_IMAGE} focal lengths"
+    else:
+        return
+    raise ObservationsError(hint, where=name, expected=expected, found=f"{sigma:g}")
 
 
 def _scalar(name: str, value: Any) -> float:
@@ -153,6 +168,8 @@ def _scalar(name: str, value: Any) -> float:
     if number < 0 or (name == "sigma_image" and number == 0):
         expected = "a positive number" if name == "sigma_image" else "zero or a positive number"
         raise ObservationsError(where=name, expected=expected, found=f"{number:g}")
+    if name.startswith("sigma_"):
+        _check_sigma(name, number)
     return number
 
 

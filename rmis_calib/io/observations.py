@@ -1,5 +1,6 @@
 """Shaft observations: the solver's own input, as arrays in memory and as an .npz file (DESIGN.md 6.2)."""
 
+import math
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -166,9 +167,37 @@ class ShaftObservations:
             np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
 
 
+_LARGEST_BYTES = 4 << 30
+"""Of all arrays of a file: six million motions of everything that can be measured."""
 CLOCK = checks.CLOCK
 """Name of the clock offset among `unknown_names`."""
 OBSERVATION_KEYS: tuple[str, ...] = tuple(field.name for field in fields(ShaftObservations))
+
+
+def _check_sizes(path: Path, archive: zipfile.ZipFile) -> None:
+    """Refuse arrays that are larger than any recording, or than their own data, before memory is taken for them.
+
+    Raises:
+        ObservationsError: names the array.
+    """
+    total = 0
+    for member in archive.infolist():
+        total += member.file_size
+        if total > _LARGEST_BYTES:
+            expected = f"arrays of {_LARGEST_BYTES / 2**30:g} GB in all at most"
+            raise ObservationsError(where=str(path), expected=expected, found=f"more by {member.filename}")
+        if not member.filename.endswith(".npy"):
+            continue
+        with archive.open(member) as data:
+            version = np.lib.format.read_magic(data)
+            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, _, dtype = read(data)
+            there = member.file_size - data.tell()
+        if not dtype.hasobject and math.prod(shape) * dtype.itemsize != there:
+            found = f"{there} bytes for shape {shape} of {dtype}"
+            raise ObservationsError(
+                where=f"{path}: {member.filename[:-4]}", expected="as many numbers as promised", found=found
+            )
 
 
 def _read_npz(path: Path) -> dict[str, np.ndarray]:
@@ -178,8 +207,11 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
                 found = "an empty file (0 bytes)" if path.stat().st_size == 0 else "another kind of file, or a cut one"
                 raise ObservationsError(where=str(path), expected="a complete .npz archive", found=found)
             file.seek(0)
-            with np.load(file, allow_pickle=False) as archive:
-                return {name: archive[name] for name in archive.files}
+            with zipfile.ZipFile(file) as archive:
+                _check_sizes(path, archive)
+            file.seek(0)
+            with np.load(file, allow_pickle=False) as arrays:
+                return {name: arrays[name] for name in arrays.files}
     except OSError as error:
         found = "nothing there" if isinstance(error, FileNotFoundError) else error.strerror
         raise FileError(where=str(path), expected="a readable .npz archive", found=found) from error

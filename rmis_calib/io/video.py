@@ -14,6 +14,7 @@ from jaxtyping import Int64, UInt8
 from torch import Tensor
 
 from rmis_calib.errors import InputError
+from rmis_calib.io._images import ImageReader
 from rmis_calib.io.readers import Reader, open_reader
 
 # Batches decoded ahead of the consumer: one hides the decoding behind the detection, one more rides out a key frame.
@@ -113,6 +114,16 @@ class FrameSource:
         found = dict(zip(order, self._reader.read(order), strict=True))
         images = np.stack([found[index] for index in indices]) if order else np.empty((0, *self.size, 3), np.uint8)
         return torch.from_numpy(images).permute(0, 3, 1, 2)
+
+    def labels(self, indices: Sequence[int]) -> Int64[Tensor, "n height width"]:
+        """Class numbers of some pictures of masks: of images, indices of a palette or grey values; of a video, grey.
+
+        Raises:
+            VideoError: one cannot be decoded, or is a picture of colours.
+        """
+        if isinstance(self._reader, ImageReader):
+            return torch.from_numpy(self._reader.labels(indices))
+        return self.frames(indices)[:, 0].long()
 
 
 def open_source(path: str | Path) -> FrameSource:

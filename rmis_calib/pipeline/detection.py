@@ -132,7 +132,7 @@ def detect(
     if isinstance(source, Recording):
         return DetectionTable(detect_recording(source, config, progress, watch, segment))
     frames = open_source(source)
-    masks = open_masks(segment or config.masks, {"right": frames}, config.device)
+    masks = open_masks(segment or config.masks, {"right": frames}, config.device, config.mask_labels)
     camera = _Camera("right", frames, frames.times_s, None, masks.get("right"), "detecting")
     return DetectionTable(_detect_views([camera], config, progress, watch))
 
@@ -150,7 +150,7 @@ def detect_recording(
     if recording.left is not None:
         views["left"] = (recording.left, rig.left)
     sources = {side: source for side, (source, _) in views.items()}
-    masks = open_masks(segment or config.masks, sources, config.device)
+    masks = open_masks(segment or config.masks, sources, config.device, config.mask_labels)
     cameras = [
         _Camera(side, source, recording.frame_times_s, camera, masks.get(side), f"detecting, {side}")
         for side, (source, camera) in views.items()

@@ -33,6 +33,8 @@ STRONG_EVIDENCE = 3.0
 """Log of the odds, 20 to 1, that the data must give for joint offsets to be estimated (Kass & Raftery 1995: strong)."""
 HELD = 1e-3
 """Part of its prior to which an offset is held that the data cannot tell from the transform."""
+OTHER_TOOL_MM = 25.0
+"""Distance of the shaft's end from its nominal place that no wrist explains: the metal of one is 5 to 20 mm long."""
 TOO_FAR_SIGMA = 4.0
 """An unknown estimated this many prior sigmas from its nominal value says that the model does not fit the data."""
 
@@ -222,11 +224,26 @@ def make_result(
         camera_right_T_arm=_transform("camera_right", "arm", solution.camera_right_T_arm) if finite else None,
         camera_left_T_camera_right=None if stereo is None else _transform("camera_left", "camera_right", stereo),
         covariance=covariance if np.isfinite(covariance).all() else None,
-        observability=observability_record(solution.observability.describe(), notes),
+        observability=observability_record(solution.observability.describe(), (*notes, *_about_tool(solution))),
         motions=motions,
         residuals=residuals,
         nuisances=_nuisance_records(solution, joint_columns),
         config=config.to_dict(),
+    )
+
+
+def _about_tool(solution: Solution) -> tuple[str, ...]:
+    """Whether the shaft ends so far from where the tool's table says that it is another tool's."""
+    end = solution.nuisances.get("end_offset")
+    if end is None:
+        return ()
+    offset, sigma = float(end.value.reshape(-1)[0]), float(end.sigma.reshape(-1)[0])
+    if abs(offset) - 3.0 * sigma < OTHER_TOOL_MM:
+        return ()
+    where = "beyond" if offset > 0 else "before"
+    return (
+        f"The shaft ends {abs(offset):.0f} mm {where} the place that the tool's table tells: does the table belong "
+        "to another tool (the wrists of S/Si and Classic instruments are 50 mm apart), or is a wrist's length missing?",
     )
 
 

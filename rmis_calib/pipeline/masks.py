@@ -14,11 +14,18 @@ from rmis_calib.vision.masks import MODEL_SUFFIXES, Segmenter, load_segmenter
 MaskReader = Callable[[FrameBatch], Tensor]
 """Masks (b, h, w) of a batch of frames."""
 
+_COLOURED = 30
+"""Levels between a pixel's colours from which a picture is one of colours; compression leaves less."""
+_MOST_CLASSES, _LARGEST_CLASS = 32, 64
+"""Few and small numbers are classes; a mask with soft edges has many grey levels."""
 _EXPECTED = "a folder of mask pictures, or a model file ending in .pt, .ts or .onnx"
 
 
 def open_masks(
-    masks: str | Path | Segmenter | None, sources: Mapping[str, FrameSource], device: str
+    masks: str | Path | Segmenter | None,
+    sources: Mapping[str, FrameSource],
+    device: str,
+    labels: tuple[int, ...] | None = None,
 ) -> dict[str, MaskReader]:
     """Masks of every camera; none for None.
 
@@ -28,6 +35,7 @@ def open_masks(
             folder of its own below it, `right` and `left`.
         sources: frames by side; there are as many masks as frames, and of their size.
         device: where models run.
+        labels: class numbers of the shaft in pictures of masks; None: bright is shaft.
 
     Raises:
         FileError: there is nothing, or neither masks nor a model.
@@ -46,19 +54,19 @@ def open_masks(
     if path.is_file() and not (len(sources) == 1 and path.suffix.lower() in IMAGE_SUFFIXES):
         raise FileError(where=str(path), expected=_EXPECTED, found="another kind of file")
     if len(sources) == 1 and not (path / "right").is_dir():
-        return {side: _by_pictures(path, source) for side, source in sources.items()}
+        return {side: _by_pictures(path, source, labels) for side, source in sources.items()}
     missing = [side for side in sources if not (path / side).is_dir()]
     if missing:
         expected = f"a folder of masks for each camera: {' and '.join(sources)}"
         raise FileError(where=str(path), expected=expected, found=f"no folder {missing[0]}")
-    return {side: _by_pictures(path / side, source) for side, source in sources.items()}
+    return {side: _by_pictures(path / side, source, labels) for side, source in sources.items()}
 
 
 def _by_model(segment: Segmenter) -> MaskReader:
     return lambda batch: segment(batch.images.to(torch.float32) / 255.0)
 
 
-def _by_pictures(path: Path, source: FrameSource) -> MaskReader:
+def _by_pictures(path: Path, source: FrameSource, labels: tuple[int, ...] | None) -> MaskReader:
     """Masks from pictures, which `open_source` has put into their order."""
     masks = open_source(path)
     if masks.count != source.count:
@@ -68,10 +76,33 @@ def _by_pictures(path: Path, source: FrameSource) -> MaskReader:
         expected = f"masks of {source.size[1]} x {source.size[0]} px, as the frames"
         raise VideoError(where=str(path), expected=expected, found=f"{masks.size[1]} x {masks.size[0]}")
 
-    def read(batch: FrameBatch) -> Tensor:
-        brightest = masks.frames(batch.indices.tolist()).amax(1)
-        if int(brightest.max()) == 1:
-            raise InputError(where=str(path), expected="masks of 0 and 255 (white on shafts)", found="0 and 1")
-        return (brightest > 127).to(batch.images.device)
+    def by_label(batch: FrameBatch) -> Tensor:
+        numbers = masks.labels(batch.indices.tolist())
+        return torch.isin(numbers, torch.tensor(labels)).to(batch.images.device)
 
-    return read
+    def by_brightness(batch: FrameBatch) -> Tensor:
+        images = masks.frames(batch.indices.tolist())
+        _refuse_classes(path, images)
+        return (images[:, 0] > 127).to(batch.images.device)
+
+    return by_brightness if labels is None else by_label
+
+
+def _refuse_classes(path: Path, images: Tensor) -> None:
+    """Refuse pictures of masks that hold class numbers or colours: what is bright in them means nothing.
+
+    Raises:
+        InputError: names the numbers that were found, and the option that says which are the shaft.
+    """
+    expected = "masks of 0 and 255 (white on shafts)"
+    if int((images.amax(1).int() - images.amin(1).int()).max()) > _COLOURED:
+        found = (
+            "colours: write one grey or palette picture of class numbers a frame, and name the shaft's by --mask-labels"
+        )
+        raise InputError(where=str(path), expected=expected, found=found)
+    values = images[:, 0].unique().tolist()
+    numbers = [value for value in values if 0 < value < 255]
+    if numbers and len(numbers) <= _MOST_CLASSES and max(numbers) <= _LARGEST_CLASS:
+        named = ", ".join(map(str, values))
+        found = f'the numbers {named}: classes? then name those of the shaft by --mask-labels (255 is often "ignore")'
+        raise InputError(where=str(path), expected=expected, found=found)

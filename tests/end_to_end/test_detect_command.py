@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from rmis_calib.cli import main
 from rmis_calib.io import load_recording, open_source
@@ -101,6 +102,28 @@ def test_masks_serve_a_calibration(recording: Path, true_masks: Path, tmp_path: 
         assert f"{usable} of 4 motions are usable" in (out / "result.json").read_text()
 
 
+@pytest.mark.parametrize("kind", ["grey", "sixteen bits", "palette"])
+def test_class_numbers_serve_as_masks(recording: Path, true_masks: Path, tmp_path: Path, kind: str) -> None:
+    """Shaft 2, wrist 1 below it, 255 to be ignored: the same lines as from black and white masks."""
+    folder = Path(shutil.copytree(true_masks, tmp_path / "classes"))
+    for path in folder.glob("*/*.png"):
+        numbers = np.where(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) > 127, 2, 0).astype(np.uint8)
+        numbers[-40:, -40:], numbers[:20, :20] = 1, 255
+        if kind == "palette":
+            picture = Image.fromarray(numbers, "P")
+            picture.putpalette([10, 200, 30, 250, 250, 250, 0, 0, 0] + [128] * 759)  # the shaft is black, as it happens
+            picture.save(path)
+        else:
+            cv2.imwrite(str(path), numbers.astype(np.uint16 if kind == "sixteen bits" else np.uint8))
+    out = {}
+    for name, masks, labels in (("white", true_masks, []), ("classes", folder, ["--mask-labels", "2"])):
+        argv = ["detect", str(recording), "--out", str(tmp_path / f"by_{name}"), "--masks", str(masks)]
+        assert main([*argv, *labels, "--overlays", "0"]) == 0
+        with np.load(tmp_path / f"by_{name}" / "lines.npz") as lines:
+            out[name] = lines["contour_xy_right"]
+    np.testing.assert_array_equal(out["white"], out["classes"])
+
+
 class Dark(torch.nn.Module):
     def forward(self, images: torch.Tensor) -> torch.Tensor:
         return (images.amax(1) < 0.28).float()
@@ -141,6 +164,13 @@ def _label_values(folder: Path) -> None:
         cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) // 255)
 
 
+def _colours(folder: Path) -> None:
+    for path in (folder / "right").iterdir():
+        picture = np.zeros((480, 640, 3), np.uint8)
+        picture[100:200, :, 2] = 200
+        cv2.imwrite(str(path), picture)
+
+
 def _truncate(folder: Path) -> None:
     path = folder / "right" / "0000.png"
     path.write_bytes(path.read_bytes()[:200])
@@ -152,7 +182,8 @@ DAMAGE = {
     "one mask too few": (_remove, ["left", "expected 4 masks", "found 3"]),
     "another size": (_shrink, ["right", "640 x 480", "320 x 240"]),
     "one of another size": (_shrink_one, ["0002.png", "640 x 480", "320 x 240"]),
-    "0 and 1": (_label_values, ["0 and 255", "0 and 1"]),
+    "0 and 1": (_label_values, ["0 and 255", "the numbers 0, 1", "--mask-labels"]),
+    "colours": (_colours, ["0 and 255", "colours", "--mask-labels"]),
     "a truncated mask": (_truncate, ["0000.png", "truncated"]),
     "a stranger": (lambda f: (f / "right" / "notes.txt").write_text("x"), ["images only", "notes.txt"]),
 }

@@ -1,5 +1,7 @@
 """Observations: what is accepted, how rows that do not count are marked, and what is refused."""
 
+import io
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +9,7 @@ import numpy as np
 import pytest
 
 from rmis_calib.errors import FileError, ObservationsError, OutputError
+from rmis_calib.io import observations
 from rmis_calib.io.observations import OBSERVATION_KEYS, ShaftObservations
 
 N = 6
@@ -334,3 +337,59 @@ def test_files_of_another_kind(tmp_path: Path) -> None:
 def test_unwritable_output(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="expected a writable place"):
         ShaftObservations(**minimal()).save(tmp_path / "none" / "obs.npz")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("sigma_image", 0.3, "sigma_image: looks like pixels; divide by the focal length"),
+        ("sigma_edge_bias", 0.2, "sigma_edge_bias: looks like pixels"),
+        ("sigma_axis_right", np.full(N, 0.4), "sigma_axis_right: looks like pixels"),
+        ("sigma_kinematics_rad", 0.1, "sigma_kinematics_rad: looks like degrees; multiply by pi / 180"),
+        ("sigma_stereo_rad", 0.5, "sigma_stereo_rad: looks like degrees"),
+    ],
+)
+def test_sigmas_in_pixels_or_degrees_are_told_by_their_size(key, value, message) -> None:
+    with pytest.raises(ObservationsError, match=message):
+        ShaftObservations(**minimal(), **{key: value})
+
+
+def test_honest_sigmas_are_kept() -> None:
+    # 20 px at a focal length of 1000 px; the noise coefficient 2 of the paper.
+    ShaftObservations(**minimal(), sigma_image=0.02, sigma_kinematics_rad=np.deg2rad(2.0), sigma_kinematics_mm=2.0)
+
+
+def npy_header(shape: tuple[int, ...], descr: str = "<f8") -> bytes:
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": descr, "fortran_order": False, "shape": shape})
+    return stream.getvalue()
+
+
+def test_an_array_that_promises_more_than_it_holds_takes_no_memory(tmp_path: Path) -> None:
+    path = tmp_path / "o.npz"
+    minimal_file = tmp_path / "good.npz"
+    np.savez(minimal_file, **minimal())
+    with zipfile.ZipFile(minimal_file) as good, zipfile.ZipFile(path, "w") as archive:
+        for name in good.namelist():
+            content = npy_header((10**10, 4, 4)) + b"0" * 64 if name == "arm_T_rcm.npy" else good.read(name)
+            archive.writestr(name, content)
+    with pytest.raises(ObservationsError, match="arm_T_rcm: expected as many numbers as promised, found 64 bytes"):
+        ShaftObservations.load(path)
+
+
+def test_a_zip_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(observations, "_LARGEST_BYTES", 1 << 22)
+    path = tmp_path / "bomb.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("arm_T_rcm.npy", npy_header((64, 1 << 16)) + b"\0" * (1 << 25))  # 32 MB of zeros
+    assert path.stat().st_size < 1 << 16
+    monkeypatch.setattr(np, "load", lambda *_, **__: pytest.fail("must refuse before it unpacks"))
+    with pytest.raises(ObservationsError, match="expected arrays of 0.0039.* GB in all at most"):
+        ShaftObservations.load(path)
+
+
+def test_a_pickle_in_an_archive_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "o.npz"
+    np.savez(path, **minimal() | {"rcm_s_end_mm": np.array([object()], dtype=object)}, allow_pickle=True)
+    with pytest.raises(ObservationsError):
+        ShaftObservations.load(path)

@@ -39,7 +39,7 @@ def test_the_stronger_trace_comes_first() -> None:
     strong_clock = likely_causes(residuals(0, clock_s=0.2, lens=70.0), None, 0)
     assert [cause[:9] for cause in strong_clock] == [CLOCK[:9], PLACE[:9]]
     strong_lens = likely_causes(residuals(0, clock_s=0.03, lens=60.0), None, 0)
-    assert [cause[:9] for cause in strong_lens] == [PLACE[:9]]
+    assert strong_lens[0].startswith(PLACE)
 
 
 def test_without_velocities_or_with_a_few_motions_nothing_is_made_up() -> None:
