@@ -4,7 +4,6 @@
 `rmis-calib-result/1`). Unknown numbers are `None` in Python and null in the file, never NaN.
 """
 
-import json
 import math
 import platform
 from collections import Counter
@@ -17,9 +16,10 @@ from typing import Any, Literal
 import numpy as np
 
 from rmis_calib import __version__
-from rmis_calib.errors import FileError, InputError
+from rmis_calib.errors import InputError
 from rmis_calib.geometry.rigid import RigidTransform
 from rmis_calib.io.atomic import write_json
+from rmis_calib.io.configs import load_json
 from rmis_calib.io.outputs import RESULT_FORMAT
 
 Status = Literal["ok", "weak", "unobservable", "solver_failed", "insufficient_data"]
@@ -204,20 +204,14 @@ class CalibrationResult:
             FileError: the file cannot be read.
             InputError: it is not a result of this format.
         """
-        try:
-            raw = json.loads(Path(path).read_text(encoding="utf-8"))
-        except OSError as error:
-            raise FileError(where=str(path), expected="a readable result file", found=error.strerror) from error
-        except ValueError as error:
-            raise InputError(where=str(path), expected="JSON", found=str(error)) from error
-        found = raw.get("format") if isinstance(raw, dict) else type(raw).__name__
-        if found != RESULT_FORMAT:
-            raise InputError(where=str(path), expected=f"format {RESULT_FORMAT}", found=found)
+        raw = load_json(path)
+        if raw.get("format") != RESULT_FORMAT:
+            raise InputError(where=str(path), expected=f"format {RESULT_FORMAT}", found=raw.get("format", "none"))
         try:
             return cls.from_dict(raw)
-        except (KeyError, TypeError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise InputError(
-                where=str(path), expected="every key of a result", found=f"missing or odd {error}"
+                where=str(path), expected="every key of a result", found=f"a missing or odd one ({_key_of(error)})"
             ) from error
 
     @classmethod
@@ -241,6 +235,10 @@ class CalibrationResult:
             notes=tuple(raw.get("notes") or ()),
             created=raw["created"],
         )
+
+
+def _key_of(error: Exception) -> str:
+    return str(error.args[0]) if isinstance(error, KeyError) else "of another type"
 
 
 def _transform_dict(transform: RigidTransform | None) -> dict[str, Any] | None:

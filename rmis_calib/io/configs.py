@@ -1,6 +1,7 @@
 """Shipped configuration files by name, and YAML read the way people write numbers."""
 
 import difflib
+import json
 import re
 import stat
 from collections.abc import Hashable
@@ -11,7 +12,8 @@ import yaml
 
 from rmis_calib.errors import ConfigError, FileError, InputError
 
-_LARGEST_YAML = 16 << 20
+LARGEST_YAML, LARGEST_JSON = 16 << 20, 1 << 30
+"""Bytes of a description that people write, and of a result that holds a line for each of millions of motions."""
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
@@ -42,7 +44,7 @@ def load_yaml(path: str | Path, error: type[InputError] = ConfigError) -> dict[s
         FileError: the file is absent or unreadable.
         ConfigError: (or the `error` given) it is not YAML, or not a mapping; names the line.
     """
-    raw = read_bytes(path, _LARGEST_YAML)
+    raw = read_bytes(path, LARGEST_YAML)
     try:
         # Thousands of nested brackets end in a recursion error, thousands of digits in a value error.
         value = yaml.load(raw.decode("utf-8-sig"), Loader=_Yaml12Loader)
@@ -51,6 +53,24 @@ def load_yaml(path: str | Path, error: type[InputError] = ConfigError) -> dict[s
     if not isinstance(value, dict):
         found = "an empty file" if value is None else type(value).__name__
         raise error(where=str(path), expected="a mapping of keys to values", found=found)
+    return value
+
+
+def load_json(path: str | Path, error: type[InputError] = InputError) -> dict[str, Any]:
+    """The mapping in a JSON file.
+
+    Raises:
+        FileError: the file is absent, unreadable or too large.
+        InputError: (or the `error` given) it is not JSON, or not a mapping.
+    """
+    raw = read_bytes(path, LARGEST_JSON)
+    try:
+        value = json.loads(raw.decode("utf-8-sig"))
+    except (ValueError, RecursionError) as problem:
+        found = "other text" if raw.strip() else "an empty file"
+        raise error(where=str(path), expected="a JSON file", found=found) from problem
+    if not isinstance(value, dict):
+        raise error(where=str(path), expected="a JSON mapping of keys to values", found=type(value).__name__)
     return value
 
 
@@ -106,11 +126,23 @@ def _config_folders(kind: str) -> list[Path]:
 def _yaml_error(path: str | Path, problem: Exception, error: type[InputError]) -> InputError:
     if isinstance(problem, yaml.MarkedYAMLError) and problem.problem_mark is not None:
         place = f"{path} line {problem.problem_mark.line + 1}"
-        return error(where=place, expected="valid YAML", found=problem.problem)
+        return error(where=place, expected="valid YAML", found=_yaml_problem(problem))
     if isinstance(problem, UnicodeDecodeError):
         return error(where=str(path), expected="UTF-8 text", found=f"byte 0x{problem.object[problem.start]:02x}")
-    found = "too many nested brackets" if isinstance(problem, RecursionError) else " ".join(str(problem).split())
+    found = "too many nested brackets" if isinstance(problem, RecursionError) else "something else"
     return error(where=str(path), expected="valid YAML", found=found)
+
+
+def _yaml_problem(problem: yaml.MarkedYAMLError) -> str:
+    """What is wrong at a mark, in our words."""
+    text = problem.problem or ""
+    if isinstance(problem, yaml.constructor.ConstructorError):
+        return "a tag (! or !!), which is not read" if "tag" in text else text
+    if isinstance(problem, yaml.composer.ComposerError):
+        return "an alias (*name) without its anchor (&name)"
+    if "\\t" in text or "tab" in text:
+        return "a tab: indent by blanks"
+    return "a stray bracket, quote, colon or indent, here or on the line before"
 
 
 class _Yaml12Loader(yaml.SafeLoader):

@@ -10,10 +10,10 @@ import os
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
 
 from rmis_calib import __version__
-from rmis_calib.errors import OutputError
+from rmis_calib.errors import FileError, InputError, OutputError
+from rmis_calib.io.configs import load_json
 
 MARKER = ".rmis-calib-output.json"
 MARKER_FORMAT = "rmis-calib-output/1"
@@ -149,10 +149,9 @@ def is_json_of(*formats: str) -> Callable[[Path], bool]:
 
     def test(path: Path) -> bool:
         try:
-            raw: Any = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError):
+            return load_json(path).get("format") in formats
+        except (FileError, InputError):
             return False
-        return isinstance(raw, dict) and raw.get("format") in formats
 
     return test
 

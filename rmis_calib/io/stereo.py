@@ -9,7 +9,7 @@ import numpy as np
 from rmis_calib.errors import RecordingError
 from rmis_calib.io._checks import Note, no_note, rigid_from_text
 from rmis_calib.io._schemas import METRES, CameraSchema, StereoSchema
-from rmis_calib.io.configs import load_yaml, read_bytes
+from rmis_calib.io.configs import LARGEST_YAML, load_yaml, read_bytes
 from rmis_calib.io.validation import validate
 
 # From the closest chip-on-tip pair to a bench rig; a laparoscope has 4 to 6 mm.
@@ -90,7 +90,7 @@ def read_stereo(path: str | Path, note: Note = no_note) -> StereoFile:
 
 
 def _refuse_opencv(path: Path) -> None:
-    head = read_bytes(path)[:4096]
+    head = read_bytes(path, LARGEST_YAML)[:4096]
     if head.startswith(b"%YAML:1.0") or b"opencv-matrix" in head or b"<opencv_storage>" in head:
         found = (
             "an OpenCV FileStorage file: copy fx, fy, cx, cy from its camera matrices and k1, k2, p1, p2, k3 from its "

@@ -13,6 +13,7 @@ from rmis_calib.geometry.rigid import RigidTransform, rigid_inverse, transform_p
 from rmis_calib.geometry.rotations import matrix_to_rotvec
 from rmis_calib.io import Recording, load_recording, load_yaml
 from rmis_calib.io._checks import no_note, rigid_from_text
+from rmis_calib.io.configs import load_json
 from rmis_calib.pipeline.kinematic_unknowns import poses_at
 from rmis_calib.pipeline.poses import MotionPoses
 from rmis_calib.results import CalibrationResult
@@ -153,7 +154,7 @@ def read_reference(path: Path) -> Reference:
         FileError: the file cannot be read.
         InputError: it holds no such transform, or an uncertainty that cannot be one.
     """
-    raw = load_yaml(path, error=InputError)
+    raw = (load_json if path.suffix.lower() == ".json" else load_yaml)(path, InputError)
     if "camera_right_T_arm" not in raw:
         raise InputError(where=str(path), expected="a key camera_right_T_arm", found=", ".join(raw))
     rows = raw["camera_right_T_arm"]
