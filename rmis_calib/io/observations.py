@@ -13,7 +13,7 @@ import numpy as np
 from rmis_calib.errors import FileError, ObservationsError
 from rmis_calib.io import _observation_checks as checks
 from rmis_calib.io.atomic import atomic_write
-from rmis_calib.io.configs import did_you_mean
+from rmis_calib.io.configs import check_regular, did_you_mean
 from rmis_calib.io.outputs import OBSERVATIONS_FORMAT, check_file, is_npz_with
 
 
@@ -201,6 +201,7 @@ def _check_sizes(path: Path, archive: zipfile.ZipFile) -> None:
 
 
 def _read_npz(path: Path) -> dict[str, np.ndarray]:
+    check_regular(path)
     try:
         with path.open("rb") as file:
             if not zipfile.is_zipfile(file):
@@ -213,8 +214,7 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
             with np.load(file, allow_pickle=False) as arrays:
                 return {name: arrays[name] for name in arrays.files}
     except OSError as error:
-        found = "nothing there" if isinstance(error, FileNotFoundError) else error.strerror
-        raise FileError(where=str(path), expected="a readable .npz archive", found=found) from error
+        raise FileError(where=str(path), expected="a readable .npz archive", found=error.strerror) from error
     except ObservationsError:
         raise
     except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, NotImplementedError) as error:

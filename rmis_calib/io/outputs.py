@@ -13,7 +13,7 @@ from pathlib import Path
 
 from rmis_calib import __version__
 from rmis_calib.errors import FileError, InputError, OutputError
-from rmis_calib.io.configs import load_json
+from rmis_calib.io.configs import check_regular, load_json
 
 MARKER = ".rmis-calib-output.json"
 MARKER_FORMAT = "rmis-calib-output/1"
@@ -170,9 +170,10 @@ def is_npz_with(name: str) -> Callable[[Path], bool]:
 
     def test(path: Path) -> bool:
         try:
+            check_regular(path)
             with zipfile.ZipFile(path) as archive:
                 return f"{name}.npy" in archive.namelist()
-        except (OSError, zipfile.BadZipFile):
+        except (OSError, FileError, zipfile.BadZipFile):
             return False
 
     return test

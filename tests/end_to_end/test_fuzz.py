@@ -68,8 +68,18 @@ def mutate(path: Path, dice: random.Random) -> str:
 
 
 TOKENS = [
-    b"", b"nan", b"-1", b"1e308", b"1e999", b"null", b"[]", b"{}", b"<script>", b"!!python/object:os.system", b"&a [*a]", b"\xff\xfe", b"0x10", b"99999999999999999999", b"true", b"'", b'"', b"../../etc/passwd", b"/dev/zero",
-]  # fmt: skip
+    *(b"", b"nan", b"-1", b"1e308", b"1e999", b"null", b"[]", b"{}", b"true", b"0x10", b"99999999999999999999"),
+    *(
+        b"<script>",
+        b"!!python/object:os.system",
+        b"&a [*a]",
+        b"\xff\xfe",
+        b"'",
+        b'"',
+        b"../../etc/passwd",
+        b"/dev/zero",
+    ),
+]
 
 
 def listing(folder: Path) -> list[str]:
