@@ -10,6 +10,7 @@ from typing import Any
 
 import av
 import numpy as np
+from av.stream import Disposition
 from av.video.frame import VideoFrame
 
 from rmis_calib.errors import VideoError
@@ -31,7 +32,7 @@ class _Index:
     """What the packets say, without decoding: display times in units of the stream's time base, sorted."""
 
     count: int
-    pts: list[int | None]
+    pts: Sequence[int | None]
     key_pts: list[int]
     promised: int
     """Packets that the container claims to hold; 0 where it claims nothing."""
@@ -76,11 +77,16 @@ class VideoReader:
             raise self._truncated(index.promised, index.present)
         if promises_more:
             self._note(f"the header promises {index.promised} frames; the {index.present} that are there were read")
-        self.count, self._pts, self._key_pts = index.count, index.pts, index.key_pts
-        if hides_frames or not self._has_pts:
-            self._pts = [frame.pts for frame in self._decode()]
-            self.count = len(self._pts)
-        if not self._has_pts:
+        self.count, self._key_pts = index.count, index.key_pts
+        stamps = index.pts
+        if hides_frames or not _are_distinct(stamps):
+            stamps = [frame.pts for frame in self._decode()]
+            self.count = len(stamps)
+        self._stamps = np.array([np.nan if stamp is None else float(stamp) for stamp in stamps])
+        """Time stamps as they are, (N,), NaN where a frame has none."""
+        self._pts = [stamp for stamp in stamps if stamp is not None] if _are_distinct(stamps) else []
+        """The same where each frame has its own: only then is a frame found by it."""
+        if not self._pts:
             self._note_stamps()
         self._turns, self._bits = self._look_at_first()
         self.size = self._size if self._turns % 2 == 0 else (self._size[1], self._size[0])
@@ -126,23 +132,22 @@ class VideoReader:
 
         A few frames without a stamp, or with that of another one, get a time between their neighbours', and a note.
         """
-        if self._time_base is None or not self._pts:
-            return np.arange(self.count) / float(self._rate) if self._rate else None
-        if self._has_pts:
+        by_rate = np.arange(self.count) / float(self._rate) if self._rate else None
+        if self._time_base is None:
+            return by_rate
+        if self._pts:
             pts = np.array(self._pts, dtype=np.int64)
             return (pts - pts[0]) * float(self._time_base)
-        stamps = np.array([np.nan if pts is None else float(pts) for pts in self._pts])
-        good = _rising(stamps)
+        good = _rising(self._stamps)
         if good.sum() < max(2, (1.0 - _MOST_WRONG_STAMPS) * self.count):
-            return np.arange(self.count) / float(self._rate) if self._rate else None
+            return by_rate
         numbers = np.arange(self.count)
-        mended = _interpolated(numbers, numbers[good], stamps[good])
+        mended = _interpolated(numbers, numbers[good], self._stamps[good])
         return (mended - mended[0]) * float(self._time_base)
 
     def _note_stamps(self) -> None:
         """Say what became of frames without a time stamp of their own."""
-        stamps = np.array([np.nan if pts is None else float(pts) for pts in self._pts])
-        wrong = np.flatnonzero(~_rising(stamps)).tolist()
+        wrong = np.flatnonzero(~_rising(self._stamps)).tolist()
         if self._time_base is None or len(wrong) == self.count:
             return
         if len(wrong) > _MOST_WRONG_STAMPS * self.count:
@@ -150,10 +155,6 @@ class VideoReader:
         elif wrong:
             frames = ", ".join(map(str, wrong[:5])) + (", ..." if len(wrong) > 5 else "")
             self._note(f"no time stamp of its own in frame {frames}: interpolated between the neighbours")
-
-    @property
-    def _has_pts(self) -> bool:
-        return None not in self._pts and len(set(self._pts)) == self.count
 
     def read_all(self, every: int = 1) -> Generator[np.ndarray, None, None]:
         """Every n-th frame from the first, (H, W, 3) uint8 RGB. All are decoded, but only those turned into RGB.
@@ -175,7 +176,7 @@ class VideoReader:
         Raises:
             VideoError: a frame cannot be decoded or does not come.
         """
-        if not self._has_pts:
+        if not self._pts:
             wanted = set(indices)
             yield from (image for number, image in enumerate(self.read_all()) if number in wanted)
             return
@@ -254,7 +255,7 @@ class VideoReader:
         try:
             with av.open(str(self.path), metadata_errors="ignore") as container:
                 # Cover art is a stream of a single picture that no camera took.
-                attached = av.stream.Disposition.attached_pic | av.stream.Disposition.timed_thumbnails
+                attached = Disposition.attached_pic | Disposition.timed_thumbnails
                 streams = [stream for stream in container.streams.video if not stream.disposition & attached]
                 if len(streams) != 1:
                     raise VideoError(where=str(self.path), expected="one video stream", found=f"{len(streams)}")
@@ -266,7 +267,8 @@ class VideoReader:
 
 
 def _read_index(container: Any, stream: Any) -> _Index:
-    pts, key_pts = [], []
+    pts: list[int | None] = []
+    key_pts: list[int] = []
     count = present = 0
     is_damaged = is_cut_short(Path(container.name))
     for packet in container.demux(stream):
@@ -281,7 +283,8 @@ def _read_index(container: Any, stream: Any) -> _Index:
         if packet.pts is not None and packet.is_keyframe:
             key_pts.append(packet.pts)
     # Without a stamp the place among the others is not known before the pictures are decoded.
-    ordered = pts if None in pts else sorted(pts)
+    known = [stamp for stamp in pts if stamp is not None]
+    ordered: Sequence[int | None] = sorted(known) if len(known) == len(pts) else pts
     return _Index(count, ordered, sorted(key_pts), stream.frames, present, is_damaged)
 
 
@@ -304,3 +307,8 @@ def _interpolated(at: np.ndarray, numbers: np.ndarray, stamps: np.ndarray) -> np
     step = (stamps[-1] - stamps[0]) / (numbers[-1] - numbers[0])
     out = np.where(at < numbers[0], stamps[0] + step * (at - numbers[0]), out)
     return np.where(at > numbers[-1], stamps[-1] + step * (at - numbers[-1]), out)
+
+
+def _are_distinct(stamps: Sequence[int | None]) -> bool:
+    """Whether each frame has a time stamp of its own."""
+    return None not in stamps and len(set(stamps)) == len(stamps)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from yaml.composer import ComposerError
 
 from rmis_calib.errors import ConfigError, FileError, InputError
 
@@ -138,7 +139,7 @@ def _yaml_problem(problem: yaml.MarkedYAMLError) -> str:
     text = problem.problem or ""
     if isinstance(problem, yaml.constructor.ConstructorError):
         return "a tag (! or !!), which is not read" if "tag" in text else text
-    if isinstance(problem, yaml.composer.ComposerError):
+    if isinstance(problem, ComposerError):
         return "an alias (*name) without its anchor (&name)"
     if "\\t" in text or "tab" in text:
         return "a tab: indent by blanks"

@@ -99,7 +99,7 @@ def first_finding(problem: ValidationError, schema: type, where: str, error: typ
     if kind == "missing":
         return error(where=place, expected="this key", found=f"nothing{tail}")
     if kind == "value_error":
-        text = str(finding["ctx"]["error"])
+        text = str(finding.get("ctx", {}).get("error", ""))
         if text.startswith(("expected ", "looks ")):
             return error(f"{text}{tail}", where=place)
         return error(where=place, expected=text, found=f"{_short(finding['input'])}{tail}")
