@@ -82,7 +82,7 @@ def test_mono_result_has_no_left(result):
     ("text", "error", "words"),
     [
         ("{", InputError, "JSON"),
-        ("[]", InputError, "format rmis-calib-result/1"),
+        ("[]", InputError, "a JSON mapping of keys to values"),
         ('{"format": "rmis-calib-result/2"}', InputError, "rmis-calib-result/2"),
         ('{"format": "rmis-calib-result/1"}', InputError, "covariance"),
     ],

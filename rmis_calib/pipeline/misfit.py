@@ -61,7 +61,7 @@ def is_misfit(result: CalibrationResult) -> bool:
     if any(value is not None and value > TOO_NOISY[name] for name, value in levels.items()):
         return True
     contradicting = sum(reason in _CONTRADICTS for reason in result.motions.reasons)
-    return contradicting > result.motions.used.sum()
+    return contradicting > int(result.motions.used.sum())
 
 
 def likely_causes(residuals: SignedResiduals, disparity: float | None, repeated: int) -> list[str]:
