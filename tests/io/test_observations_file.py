@@ -330,7 +330,7 @@ def test_files_of_another_kind(tmp_path: Path) -> None:
         ShaftObservations.load(tmp_path / "pickled.npz")
     with pytest.raises(FileError, match=r"none\.npz: expected a readable file, found nothing there"):
         ShaftObservations.load(tmp_path / "none.npz")
-    with pytest.raises(FileError, match="Is a directory"):
+    with pytest.raises(FileError, match="found a folder"):
         ShaftObservations.load(tmp_path)
 
 
