@@ -118,3 +118,15 @@ def test_an_offset_of_no_effect_changes_nothing(solved):
     np.testing.assert_allclose(still.covariance, bare.covariance, rtol=1e-6)
     np.testing.assert_allclose(still.camera_right_T_arm.matrix, bare.camera_right_T_arm.matrix, atol=1e-8)
     assert still.nuisances["clock"]["held"]
+
+
+def test_the_table_of_another_tool_is_named(solved):
+    """Wrists of two families of instruments are about 50 mm apart: the ends of the shaft tell."""
+    _, seen, _, _ = solved
+    other = replace(seen, rcm_s_end_mm=seen.rcm_s_end_mm + 50.0)
+
+    def sentences(observations):
+        return rc.solve(observations, throw=False).observability["sentences"]
+
+    assert any("mm before the place" in words and "another tool" in words for words in sentences(other))
+    assert not any("another tool" in words for words in sentences(seen))

@@ -18,6 +18,7 @@ from rmis_calib.pipeline.estimation import estimate, problem_of
 from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
 from rmis_calib.pipeline.next_motion import advice_record, camera_view, joint_box, joint_candidates, seen_view
 from rmis_calib.pipeline.poses import motion_poses
+from rmis_calib.solver.assess.observability import assess
 
 SIGMA_PX = 0.2
 CONFIG = parse_config({"edge_bias_px": 0.0, "solver": {"bias_correction": False, "advice": {"candidates": 200}}})
@@ -164,3 +165,37 @@ def test_views_of_a_camera_and_of_measurements(weak):
     least, greatest = seen_view(problem)[0, :2], seen_view(problem)[0, 2:]
     points = torch.as_tensor(weak[2].contour_right).flatten(0, 2)
     assert bool((least <= points.amin(0)).all() & (greatest >= points.amax(0)).all())
+
+
+def test_motions_advised_together_are_distinct(weak):
+    """A motion that shrinks the most twice over is still one motion to whoever moves the arms."""
+    config = parse_config(
+        {"edge_bias_px": 0.0, "solver": {"bias_correction": False, "advice": {"candidates": 200, "motions": 5}}}
+    )
+    _, record, _ = advised(weak, config)
+    words = [motion["words"] for motion in record["next_motions"]]
+    assert len(words) > 1
+    assert len(set(words)) == len(words)
+
+
+def test_the_number_in_words_is_the_number_in_the_bar(weak):
+    """The bar shows the result's own sigmas (`observability.directions`), the sentence must start from the first."""
+    recording, unknowns, seen = weak
+    solution = estimate(seen, CONFIG)
+    allowance = 0.3**2 * torch.eye(6, dtype=torch.float64)  # as for joint offsets that nobody saw
+    allowance[:3, :3] *= 1e-4
+    used = np.ones(len(seen.arm_T_rcm), dtype=bool)
+    problem = problem_of(seen, CONFIG)
+    X, covariance = solution.camera_right_T_arm[None], solution.covariance[None] + allowance
+    verdict, degeneracy = CONFIG.solver.verdict, solution.observability.degeneracy
+    allowed = assess(problem.flatten_batch(), X[:, :3, :3], X[:, :3, 3], covariance, verdict, degeneracy)
+    widened = replace(solution, covariance=covariance[0], observability=allowed)
+    candidates = joint_candidates(recording, unknowns, problem, widened, used, CONFIG.solver.advice, seed=0)
+    view = camera_view(recording.stereo.right)[None]
+    for case in (solution, widened):
+        record = advice_record(case, candidates, view, CONFIG, "within reach")
+        bar = case.observability.describe().directions[0][0]
+        said = re.search(r"shrinks from ([\d.]+) mm to ([\d.]+) mm", record["advice"][0])
+        assert said is not None, record["advice"][0]
+        assert float(said[1]) == pytest.approx(bar, rel=0.06)
+        assert float(said[2]) == pytest.approx(record["next_motions"][0]["weakest_sigma_mm"], rel=0.06)
