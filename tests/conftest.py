@@ -7,7 +7,7 @@ import pytest
 import torch
 
 # One thread: the tests' tensors are small, and two cores are shared with decoding threads.
-torch.set_num_threads(int(os.environ.get("RMIS_CALIB_TEST_THREADS", "2")))
+torch.set_num_threads(int(os.environ.get("RMIS_CALIB_TEST_THREADS", "1")))
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
