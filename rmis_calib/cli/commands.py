@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from pydantic import ValidationError
 
-from rmis_calib.cli import EXIT_NOT_TRUSTWORTHY, EXIT_OK
-from rmis_calib.cli.console import ProgressCallback, console, print_advice, print_table, progress_reporter
+from rmis_calib.cli import EXIT_OK
+from rmis_calib.cli.console import ProgressCallback, conclude, print_table, progress_reporter, say
+from rmis_calib.cli.paths import beside, check_output_folder, setting_inputs
 from rmis_calib.cli.usage import parse_arguments
 from rmis_calib.config import CalibrationConfig, load_config
-from rmis_calib.errors import FileError, InputError, OutputError
+from rmis_calib.errors import InputError, OutputError
 from rmis_calib.io.configs import check_regular
 from rmis_calib.io.folders import DESCRIPTION, recording_folder
 from rmis_calib.io.outputs import (
@@ -21,9 +22,7 @@ from rmis_calib.io.outputs import (
     RESULT_FORMAT,
     check_apart,
     check_file,
-    check_folder,
     is_json_of,
-    numbered,
 )
 from rmis_calib.io.validation import first_finding
 
@@ -290,41 +289,6 @@ class Demo(_Estimates):
         return code
 
 
-def setting_inputs(config: str | None, settings: CalibrationConfig) -> list[Path]:
-    """Files that a command's settings name, which exist.
-
-    Raises:
-        FileError: masks or a prior that are not there.
-    """
-    for flag, value in (("--masks", settings.masks), ("--prior", settings.prior)):
-        if value is not None and not Path(value).exists():
-            what = {"--masks": "a folder of mask pictures, or a model file", "--prior": "a YAML file or a result.json"}
-            raise FileError(where=value, expected=what[flag], found="nothing there")
-    named = [Path(value) for value in (config, settings.masks, settings.prior) if value is not None]
-    return [path for path in named if path.exists()]
-
-
-def beside(source: Path, ending: str, suffix: str = "") -> Path:
-    """A fresh name beside an input, in the folder that holds it."""
-    named = source if source.name not in ("", "..") else source.resolve()
-    return numbered(named.with_name(named.name + ending), suffix)
-
-
-def check_output_folder(out: Path, inputs: list[Path], overwrite: bool) -> None:
-    """Refuse a folder that may not be written, before any work.
-
-    Raises:
-        OutputError: it is, contains or lies in an input, or holds what this program did not write.
-    """
-    check_apart(out, inputs)
-    check_folder(out.absolute(), overwrite)
-
-
-def say(line: str) -> None:
-    """One line on standard output, as it is: a folder may be called [bold]."""
-    console.print(line, soft_wrap=True, markup=False)
-
-
 def calibrate_folder(
     source: "RecordingDescription",
     out: Path,
@@ -372,43 +336,3 @@ def render_recording(
         raise OutputError(where=str(out), expected=str(error), found="another one") from error
     except OSError as error:
         raise OutputError(where=str(out), expected="a place that can be written", found=error.strerror) from error
-
-
-def conclude(result: "CalibrationResult", written: Path) -> int:
-    """Print the answer and where it is; the exit code says whether to trust it."""
-    console.print(result.status, style="bold", end="")
-    say(f": {result.message}\n")
-    print_table(result.camera_right_T_arm.name if result.camera_right_T_arm else "no transform", result_rows(result))
-    for note in result.notes:
-        say(f"note: {note}")
-    if not result.trustworthy:
-        print_advice(result.observability.get("advice") or [])
-    say(f"written: {written}\n")
-    return EXIT_OK if result.trustworthy else EXIT_NOT_TRUSTWORTHY
-
-
-def result_rows(result: "CalibrationResult") -> list[tuple[str, str]]:
-    """The answer with frames, units and uncertainty."""
-    rows: list[tuple[str, str]] = []
-    transform = result.camera_right_T_arm
-    if transform is not None:
-        matrix = transform.matrix.tolist()
-        lines = ["".join(f"{x:10.6f}" for x in row[:3]) + f"{row[3]:12.4f}" for row in matrix[:3]]
-        rows.append(("rotation | translation, mm", "\n".join(lines)))
-        rows.append(("quaternion wxyz", "".join(f"{x:10.6f}" for x in transform.quat_wxyz.tolist())))
-    if result.rotation_sigma_deg is not None and result.translation_sigma_mm is not None:
-        rows.append(("1 sigma", f"{result.rotation_sigma_deg:.3f} deg, {result.translation_sigma_mm:.3f} mm"))
-    used, total = int(result.motions.used.sum()), len(result.motions.used)
-    rows.append(("motions used", f"{used} of {total} (method {result.method})"))
-    rows += [(f"  {count} rejected", reason) for reason, count in result.motions.rejected_by_reason.items()]
-    for kind, residual in result.residuals.items():
-        if residual["median"] is not None:
-            rows.append((f"residual, {kind.replace('_', ' ')}", f"median {residual['median']:.3g} {residual['unit']}"))
-    for name, nuisance in result.nuisances.items():
-        if name.startswith("edge_bias"):  # eight hundredths of a pixel: for result.json and the report
-            continue
-        sigma = "" if nuisance["sigma"] is None else f" +- {nuisance['sigma']:.2g}"
-        held = " (held by its prior)" if nuisance.get("held") else ""
-        value = 0.0 if abs(nuisance["value"]) < 1e-9 * (nuisance["sigma"] or 0.0) else nuisance["value"]  # rounding
-        rows.append((name.replace("_", " "), f"{value:.4g}{sigma} {nuisance['unit']}{held}"))
-    return rows

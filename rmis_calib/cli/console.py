@@ -4,11 +4,17 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
+
+from rmis_calib.cli import EXIT_NOT_TRUSTWORTHY, EXIT_OK
+
+if TYPE_CHECKING:
+    from rmis_calib.results import CalibrationResult
 
 ProgressCallback = Callable[[str, int, int], None]
 LOG_INTERVAL_S = 5.0
@@ -65,3 +71,48 @@ def print_advice(sentences: list[str]) -> None:
         for sentence in sentences:
             console.print(f"  {sentence}", soft_wrap=True, markup=False)
         console.print()
+
+
+def say(line: str) -> None:
+    """One line on standard output, as it is: a folder may be called [bold]."""
+    console.print(line, soft_wrap=True, markup=False)
+
+
+def conclude(result: "CalibrationResult", written: Path) -> int:
+    """Print the answer and where it is; the exit code says whether to trust it."""
+    console.print(result.status, style="bold", end="")
+    say(f": {result.message}\n")
+    print_table(result.camera_right_T_arm.name if result.camera_right_T_arm else "no transform", result_rows(result))
+    for note in result.notes:
+        say(f"note: {note}")
+    if not result.trustworthy:
+        print_advice(result.observability.get("advice") or [])
+    say(f"written: {written}\n")
+    return EXIT_OK if result.trustworthy else EXIT_NOT_TRUSTWORTHY
+
+
+def result_rows(result: "CalibrationResult") -> list[tuple[str, str]]:
+    """The answer with frames, units and uncertainty."""
+    rows: list[tuple[str, str]] = []
+    transform = result.camera_right_T_arm
+    if transform is not None:
+        matrix = transform.matrix.tolist()
+        lines = ["".join(f"{x:10.6f}" for x in row[:3]) + f"{row[3]:12.4f}" for row in matrix[:3]]
+        rows.append(("rotation | translation, mm", "\n".join(lines)))
+        rows.append(("quaternion wxyz", "".join(f"{x:10.6f}" for x in transform.quat_wxyz.tolist())))
+    if result.rotation_sigma_deg is not None and result.translation_sigma_mm is not None:
+        rows.append(("1 sigma", f"{result.rotation_sigma_deg:.3f} deg, {result.translation_sigma_mm:.3f} mm"))
+    used, total = int(result.motions.used.sum()), len(result.motions.used)
+    rows.append(("motions used", f"{used} of {total} (method {result.method})"))
+    rows += [(f"  {count} rejected", reason) for reason, count in result.motions.rejected_by_reason.items()]
+    for kind, residual in result.residuals.items():
+        if residual["median"] is not None:
+            rows.append((f"residual, {kind.replace('_', ' ')}", f"median {residual['median']:.3g} {residual['unit']}"))
+    for name, nuisance in result.nuisances.items():
+        if name.startswith("edge_bias"):  # eight hundredths of a pixel: for result.json and the report
+            continue
+        sigma = "" if nuisance["sigma"] is None else f" +- {nuisance['sigma']:.2g}"
+        held = " (held by its prior)" if nuisance.get("held") else ""
+        value = 0.0 if abs(nuisance["value"]) < 1e-9 * (nuisance["sigma"] or 0.0) else nuisance["value"]  # rounding
+        rows.append((name.replace("_", " "), f"{value:.4g}{sigma} {nuisance['unit']}{held}"))
+    return rows

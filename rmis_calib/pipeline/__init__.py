@@ -5,7 +5,7 @@ from rmis_calib._lazy import lazy_exports
 __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
-        "CalibrationRun": ".calibration",
+        "CalibrationRun": ".run",
         "Evaluation": ".evaluation",
         "calibrate": ".calibration",
         "detect": ".detection",

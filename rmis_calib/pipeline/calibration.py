@@ -1,16 +1,14 @@
 """The calibration of one recording: detect, forward kinematics, assemble, solve, choose again, check."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.errors import InsufficientDataError
-from rmis_calib.io import Recording, ShaftObservations
+from rmis_calib.io import Recording
 from rmis_calib.pipeline.choosing import (
     Choice,
     association_gate,
@@ -35,16 +33,9 @@ from rmis_calib.pipeline.kinematic_unknowns import (
     KinematicUnknowns,
     estimated_offsets,
     poses_at,
-    poses_at_motions,
     with_rcm_offset,
 )
-from rmis_calib.pipeline.misfit import (
-    is_misfit,
-    joined_residuals,
-    likely_causes,
-    misfit_message,
-    signed_residuals,
-)
+from rmis_calib.pipeline.misfit import with_misfit_named
 from rmis_calib.pipeline.next_motion import (
     advice_record,
     camera_view,
@@ -52,78 +43,19 @@ from rmis_calib.pipeline.next_motion import (
     limits_in_words,
     may_advise,
 )
-from rmis_calib.pipeline.observing import (
-    assemble,
-    predict_contours,
-    predict_ends,
-    reasons_for,
-    select_frames,
-)
+from rmis_calib.pipeline.observing import assemble, reasons_for, select_frames
 from rmis_calib.pipeline.poses import MotionPoses, motion_poses
+from rmis_calib.pipeline.run import CalibrationRun
 from rmis_calib.pipeline.starting import first_choices, read_prior
 from rmis_calib.results import STATUS_SENTENCES, CalibrationResult, Motions
-from rmis_calib.solver import Solution, SolveStatus
-from rmis_calib.vision import FrameReason, ShaftDetections
+from rmis_calib.solver import Solution
+from rmis_calib.vision import ShaftDetections
 from rmis_calib.vision.masks import Segmenter
 
 JOINTS_UNKNOWN = "the joint log does not cover this time"
 TOO_FEW = "usable, but there are too few"
-VELOCITY_STEP_S = 0.01
-"""Time from which the velocity of the shaft in the picture is told."""
 CHOICE_ROUNDS = 3
 """Solves at most: a choice of candidates that has not settled by then alternates between equals."""
-
-
-@dataclass(frozen=True, eq=False)
-class CalibrationRun:
-    """A result with everything it came from, for reports and for solving again.
-
-    Attributes:
-        result: the answer.
-        recording: what was calibrated.
-        views: frames and detections of each camera.
-        poses: kinematics of the motions.
-        choices: candidate taken in each view.
-        observations: what the solver saw.
-        solution: what the solver returned; None when there were too few motions to solve.
-    """
-
-    result: CalibrationResult
-    recording: Recording
-    views: tuple[View, ...]
-    poses: MotionPoses
-    choices: tuple[Choice, ...]
-    observations: ShaftObservations | None
-    solution: Solution | None
-
-    @property
-    def clock_s(self) -> float | None:
-        """Clock offset that was found; None where it is no unknown or the data cannot tell it."""
-        clock = None if self.solution is None else self.solution.nuisances.get("clock")
-        return None if clock is None or bool(clock.held) else float(clock.value)
-
-    def predicted_contours(self, view: View) -> Float[Tensor, "m 2 3"] | None:
-        """Contour planes where the result puts the shaft, in one view's camera."""
-        camera_T_arm = self._camera_T_arm(view)
-        if camera_T_arm is None:
-            return None
-        return predict_contours(
-            camera_T_arm, self.poses, self._estimated("radius", self.recording.shaft_diameter_mm / 2)
-        )
-
-    def predicted_ends(self, view: View) -> Float[Tensor, "m 3"] | None:
-        """Where the result puts the shaft's end, mm, in one view's camera."""
-        camera_T_arm = self._camera_T_arm(view)
-        return (
-            None if camera_T_arm is None else predict_ends(camera_T_arm, self.poses, self._estimated("end_offset", 0.0))
-        )
-
-    def _camera_T_arm(self, view: View) -> Float[Tensor, "4 4"] | None:
-        transform = self.result.camera_right_T_arm if view.side == "right" else self.result.camera_left_T_arm
-        return None if transform is None else transform.matrix.to(self.poses.arm_T_rcm.device)
-
-    def _estimated(self, name: str, otherwise: float) -> float:
-        return float(self.result.nuisances.get(name, {"value": otherwise})["value"])
 
 
 def calibrate(
@@ -180,47 +112,9 @@ def run_calibration(
         run = _solve_choice(recording, draft, views, poses, better, progress, run.clock_s)
     if draft != config:
         run = _solve_choice(recording, config, views, poses, run.choices, progress, run.clock_s)
-    result = _with_misfit_named(run, config)
+    result = with_misfit_named(run, config)
     run = replace(run, result=replace(result, notes=recording.notes + notes + result.notes))
     return _advised(run, config)
-
-
-def _with_misfit_named(run: CalibrationRun, config: CalibrationConfig) -> CalibrationResult:
-    """The result; one that is not trustworthy because pictures and joints do not fit says so first, with the causes."""
-    result, solution = run.result, run.solution
-    if solution is None or result.camera_right_T_arm is None or result.trustworthy:
-        return result
-    status = SolveStatus(int(solution.status))
-    if status in (SolveStatus.CONVERGED, SolveStatus.SINGULAR, SolveStatus.NON_FINITE) and not is_misfit(result):
-        return result
-    unknowns = KinematicUnknowns(run.recording, run.poses.frames, config.device)
-    parts = []
-    for view, choice in zip(run.views, run.choices, strict=True):
-        now, later = run.predicted_contours(view), None
-        if unknowns.has_clock and now is not None:
-            at = poses_at_motions(unknowns, run.poses, result.kinematic_offsets, VELOCITY_STEP_S)
-            later = replace(run, poses=at).predicted_contours(view)
-        if now is not None and view.camera is not None:
-            found = select_frames(view.detections, run.poses.frames)
-            parts.append(signed_residuals(found, choice, now, later, VELOCITY_STEP_S, view.camera))
-    repeated = sum(reason == FrameReason.REPEATED.sentence for reason in result.motions.reasons)
-    causes = likely_causes(joined_residuals(parts), _disparity(run), repeated) if parts else []
-    return replace(result, message=misfit_message(result, causes))
-
-
-def _disparity(run: CalibrationRun) -> float | None:
-    """Median of x_left - x_right of the shaft's end, signed by the baseline; negative where the cameras are swapped."""
-    extrinsics = run.recording.stereo.camera_left_T_camera_right
-    if extrinsics is None or len(run.views) < 2:
-        return None
-    middles = []
-    for view, choice in zip(run.views, run.choices, strict=True):
-        found = select_frames(view.detections, run.poses.frames)
-        rows = torch.arange(len(choice.candidate), device=choice.candidate.device)
-        xy = torch.where(found.end_valid[..., None], found.end_xy, torch.nan)[rows, choice.candidate.clamp_min(0)]
-        middles.append(torch.where(choice.taken[:, None], xy, torch.nan)[:, 0].double())
-    gap = (middles[1] - middles[0]) * torch.sign(extrinsics.t[0]).to(middles[0].device)
-    return float(gap.nanmedian()) if bool(torch.isfinite(gap).any()) else None
 
 
 def _without_repeats(views: tuple[View, ...], poses: MotionPoses) -> tuple[tuple[View, ...], tuple[str, ...]]:

@@ -4,19 +4,22 @@ A model that does not fit shows as noise larger than any robot's and camera's. T
 not move") it would send people to record again what is wrong in a file.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rmis_calib.config import CalibrationConfig
 from rmis_calib.geometry.cameras import Camera
 from rmis_calib.pipeline.choosing import Choice
-from rmis_calib.pipeline.observing import ANOTHER_INSTRUMENT
+from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns, poses_at_motions
+from rmis_calib.pipeline.observing import ANOTHER_INSTRUMENT, select_frames
+from rmis_calib.pipeline.run import CalibrationRun
 from rmis_calib.results import CalibrationResult
-from rmis_calib.solver import MotionReason
-from rmis_calib.vision import ShaftDetections
+from rmis_calib.solver import MotionReason, SolveStatus
+from rmis_calib.vision import FrameReason, ShaftDetections
 
 _MM, _RAD, _LINE = "noise kinematics_mm", "noise kinematics_rad", "noise line"
 TOO_NOISY = {_MM: 2.0, _RAD: 0.012, _LINE: 6.0}
@@ -27,6 +30,49 @@ EXPLAINS = 0.2
 """Share of the residuals' variance from which something is named as a cause."""
 _LEAST = 8
 """Fewest motions that causes are told from."""
+VELOCITY_STEP_S = 0.01
+"""Time from which the velocity of the shaft in the picture is told."""
+_TELLING = (SolveStatus.CONVERGED, SolveStatus.SINGULAR, SolveStatus.NON_FINITE)
+"""How a solve can end that says nothing against the model by itself."""
+
+
+def with_misfit_named(run: CalibrationRun, config: CalibrationConfig) -> CalibrationResult:
+    """The result; one that is not trustworthy because pictures and joints do not fit says so first, with the causes."""
+    result, solution = run.result, run.solution
+    if solution is None or result.camera_right_T_arm is None or result.trustworthy:
+        return result
+    if SolveStatus(int(solution.status)) in _TELLING and not is_misfit(result):
+        return result
+    unknowns = KinematicUnknowns(run.recording, run.poses.frames, config.device)
+    found = [select_frames(view.detections, run.poses.frames) for view in run.views]
+    moved = None
+    if unknowns.has_clock:
+        at = poses_at_motions(unknowns, run.poses, result.kinematic_offsets, VELOCITY_STEP_S)
+        moved = replace(run, poses=at)
+    parts = []
+    for view, detections, choice in zip(run.views, found, run.choices, strict=True):
+        now = run.predicted_contours(view)
+        if now is not None and view.camera is not None:
+            later = None if moved is None else moved.predicted_contours(view)
+            parts.append(signed_residuals(detections, choice, now, later, VELOCITY_STEP_S, view.camera))
+    repeated = sum(reason == FrameReason.REPEATED.sentence for reason in result.motions.reasons)
+    causes = likely_causes(joined_residuals(parts), _disparity(run, found), repeated) if parts else []
+    return replace(result, message=misfit_message(result, causes))
+
+
+def _disparity(run: CalibrationRun, found: list[ShaftDetections]) -> float | None:
+    """Median of x_left - x_right of the shaft's end, signed by the baseline; negative where the cameras are swapped."""
+    extrinsics = run.recording.stereo.camera_left_T_camera_right
+    if extrinsics is None or len(found) < 2:
+        return None
+    ends_x = []
+    for detections, choice in zip(found, run.choices, strict=True):
+        rows = torch.arange(len(choice.candidate), device=choice.candidate.device)
+        xy = torch.where(detections.end_valid[..., None], detections.end_xy, torch.nan)
+        chosen = xy[rows, choice.candidate.clamp_min(0)]
+        ends_x.append(torch.where(choice.taken[:, None], chosen, torch.nan)[:, 0].double())
+    gap = (ends_x[1] - ends_x[0]) * torch.sign(extrinsics.t[0]).to(ends_x[0].device)
+    return float(gap.nanmedian()) if bool(torch.isfinite(gap).any()) else None
 
 
 def misfit_message(result: CalibrationResult, causes: list[str]) -> str:

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 
 from rmis_calib.io.atomic import write_yaml
-from rmis_calib.pipeline.calibration import CalibrationRun
 from rmis_calib.pipeline.detection import DetectionTable, View
+from rmis_calib.pipeline.run import CalibrationRun
 from rmis_calib.report.detection_pictures import write_picture
 from rmis_calib.report.page import write_report
 from rmis_calib.report.pictures import overlays

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rmis_calib.geometry.cameras import Camera
-from rmis_calib.pipeline.calibration import CalibrationRun
 from rmis_calib.pipeline.detection import View
+from rmis_calib.pipeline.run import CalibrationRun
 from rmis_calib.report.overlays import DETECTED_RGB, PREDICTED_RGB, Overlay
 from rmis_calib.results import CalibrationResult
 from rmis_calib.vision import draw_dot, draw_polyline

@@ -116,13 +116,7 @@ def advise(
 
     before, *now = left(information)
     view = _narrowed(view, now[1] / torch.linalg.vector_norm(working_point_mm))
-    each, seen = [], []
-    for n in range(0, candidates.n_motions, settings.chunk):
-        part = candidates.select_motions(slice(n, n + settings.chunk))
-        measured, visible = _predicted(pack(part, settings.noise), state, view, settings.advice.nearest_mm)
-        each.append(motion_information(WeightedModel(measured, posterior.layout, posterior.noise), state)[0])
-        seen.append(visible)
-    gain, visible = torch.cat(each), torch.cat(seen)
+    gain, visible = _predicted_information(candidates, posterior, view, settings)
     chosen, path = [], [now]
     alone = torch.full_like(gain[:, 0, 0], torch.inf)
     open_ = visible
@@ -157,6 +151,19 @@ def _alike(candidates: Problem, index: int) -> Bool[Tensor, " m"]:
     near = (T[:, :3, 3] - T[index, :3, 3]).norm(dim=-1) < ALIKE_MM
     along = torch.nan_to_num(s - s[index]).abs() < ALIKE_MM
     return (cosine.acos() < ALIKE_RAD) & near & along
+
+
+def _predicted_information(
+    candidates: Problem, posterior: Posterior, view: Float[Tensor, "c 4"], settings: SolverSettings
+) -> tuple[Float[Tensor, "m p p"], Bool[Tensor, " m"]]:
+    """What each candidate would add to the information, and whether some camera sees it."""
+    each, seen = [], []
+    for n in range(0, candidates.n_motions, settings.chunk):
+        part = candidates.select_motions(slice(n, n + settings.chunk))
+        measured, visible = _predicted(pack(part, settings.noise), posterior.state, view, settings.advice.nearest_mm)
+        each.append(motion_information(WeightedModel(measured, posterior.layout, posterior.noise), posterior.state)[0])
+        seen.append(visible)
+    return torch.cat(each), torch.cat(seen)
 
 
 def _narrowed(view: Float[Tensor, "c 4"], sigma: Float[Tensor, ""]) -> Float[Tensor, "c 4"]:

@@ -1,0 +1,66 @@
+"""One calibration with everything that it came from."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+from rmis_calib.io import Recording, ShaftObservations
+from rmis_calib.pipeline.choosing import Choice
+from rmis_calib.pipeline.detection import View
+from rmis_calib.pipeline.observing import predict_contours, predict_ends
+from rmis_calib.pipeline.poses import MotionPoses
+from rmis_calib.results import CalibrationResult
+from rmis_calib.solver import Solution
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationRun:
+    """A result with everything it came from, for reports and for solving again.
+
+    Attributes:
+        result: the answer.
+        recording: what was calibrated.
+        views: frames and detections of each camera.
+        poses: kinematics of the motions.
+        choices: candidate taken in each view.
+        observations: what the solver saw.
+        solution: what the solver returned; None when there were too few motions to solve.
+    """
+
+    result: CalibrationResult
+    recording: Recording
+    views: tuple[View, ...]
+    poses: MotionPoses
+    choices: tuple[Choice, ...]
+    observations: ShaftObservations | None
+    solution: Solution | None
+
+    @property
+    def clock_s(self) -> float | None:
+        """Clock offset that was found; None where it is no unknown or the data cannot tell it."""
+        clock = None if self.solution is None else self.solution.nuisances.get("clock")
+        return None if clock is None or bool(clock.held) else float(clock.value)
+
+    def predicted_contours(self, view: View) -> Float[Tensor, "m 2 3"] | None:
+        """Contour planes where the result puts the shaft, in one view's camera."""
+        camera_T_arm = self._camera_T_arm(view)
+        if camera_T_arm is None:
+            return None
+        return predict_contours(
+            camera_T_arm, self.poses, self._estimated("radius", self.recording.shaft_diameter_mm / 2)
+        )
+
+    def predicted_ends(self, view: View) -> Float[Tensor, "m 3"] | None:
+        """Where the result puts the shaft's end, mm, in one view's camera."""
+        camera_T_arm = self._camera_T_arm(view)
+        return (
+            None if camera_T_arm is None else predict_ends(camera_T_arm, self.poses, self._estimated("end_offset", 0.0))
+        )
+
+    def _camera_T_arm(self, view: View) -> Float[Tensor, "4 4"] | None:
+        transform = self.result.camera_right_T_arm if view.side == "right" else self.result.camera_left_T_arm
+        return None if transform is None else transform.matrix.to(self.poses.arm_T_rcm.device)
+
+    def _estimated(self, name: str, otherwise: float) -> float:
+        return float(self.result.nuisances.get(name, {"value": otherwise})["value"])
