@@ -263,7 +263,9 @@ class VideoReader:
                 stream.thread_type = "AUTO"
                 yield container, stream
         except av.FFmpegError as error:
-            raise VideoError(where=str(self.path), expected="a complete video", found=error.strerror) from error
+            is_cut = self.path.is_file() and is_cut_short(self.path)
+            found = "a file cut short, without its index: copy or record it again" if is_cut else error.strerror
+            raise VideoError(where=str(self.path), expected="a complete video", found=found) from error
 
 
 def _read_index(container: Any, stream: Any) -> _Index:

@@ -79,7 +79,9 @@ def misfit_message(result: CalibrationResult, causes: list[str]) -> str:
     """The result's message with the misfit first, its likely causes, and only then what else was to be said."""
     levels = {name: result.nuisances.get(name, {}).get("value") for name in TOO_NOISY}
     mm, rad = levels[_MM], levels[_RAD]
-    size = f" (as if the joints were noisy by {mm:.2g} mm and {np.rad2deg(rad):.2g} deg)" if mm and rad else ""
+    size = ""
+    if mm is not None and rad is not None and (mm > TOO_NOISY[_MM] or rad > TOO_NOISY[_RAD]):
+        size = f" (as if the joints were noisy by {mm:.2g} mm and {np.rad2deg(rad):.2g} deg)"
     likely = "; then: ".join(causes)
     head, _, rest = result.message.partition(": ")
     rest = rest.partition(": are the cameras swapped")[0]

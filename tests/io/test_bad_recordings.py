@@ -148,7 +148,7 @@ CASES: dict[str, Case] = {
     "truncated video": (
         lambda f: truncate(f.path / "right.mp4", 0.6),
         VideoError,
-        r"right\.mp4: expected a complete video",
+        r"right\.mp4: expected a complete video, found a file cut short",
     ),
     "text as video": (write("right.mp4", b"hello " * 99), VideoError, r"right\.mp4: expected a complete video"),
     "wrong size": (

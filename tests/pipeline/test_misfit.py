@@ -11,7 +11,8 @@ import yaml
 import data_synth
 import rmis_calib as rc
 from rmis_calib.config import parse_config
-from rmis_calib.pipeline.misfit import SignedResiduals, likely_causes
+from rmis_calib.pipeline.misfit import SignedResiduals, likely_causes, misfit_message
+from rmis_calib.results import Motions
 
 N = 120
 CLOCK, PLACE, SWAPPED = "the clock or the frame rate", "focal length, crop or lens", "look swapped"
@@ -40,6 +41,25 @@ def test_the_stronger_trace_comes_first() -> None:
     assert [cause[:9] for cause in strong_clock] == [CLOCK[:9], PLACE[:9]]
     strong_lens = likely_causes(residuals(0, clock_s=0.03, lens=60.0), None, 0)
     assert strong_lens[0].startswith(PLACE)
+
+
+@pytest.mark.parametrize(("mm", "deg", "told"), [(0.08, 0.03, False), (2.5, 0.03, True), (0.08, 0.9, True)])
+def test_only_a_noise_that_no_robot_has_is_quoted(mm, deg, told) -> None:
+    """Small levels beside another cause would say that the joints fit well."""
+    result = rc.CalibrationResult(
+        status="weak",
+        message="weak: the cameras disagree",
+        method="joint",
+        camera_right_T_arm=None,
+        camera_left_T_camera_right=None,
+        covariance=None,
+        observability={},
+        motions=Motions(np.zeros(0, dtype=bool), (), None),
+        nuisances={"noise kinematics_mm": {"value": mm}, "noise kinematics_rad": {"value": np.deg2rad(deg)}},
+    )
+    message = misfit_message(result, ["the cameras look swapped"])
+    assert ("as if the joints were noisy" in message) == told
+    assert "Likely: the cameras look swapped. (the cameras disagree)" in message
 
 
 def test_without_velocities_or_with_a_few_motions_nothing_is_made_up() -> None:
