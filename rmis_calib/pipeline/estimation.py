@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.errors import CalibrationFailed
@@ -31,8 +33,8 @@ CLEARLY_BETTER = 0.5
 looks only when the arms rest sees no clock, and its scan has a flat minimum."""
 STRONG_EVIDENCE = 3.0
 """Log of the odds, 20 to 1, that the data must give for joint offsets to be estimated (Kass & Raftery 1995: strong)."""
-HELD = 1e-3
-"""Part of its prior to which an offset is held that the data cannot tell from the transform."""
+MIXED_SHARE = 0.1
+"""Part of a joint's offset that must lie in the unseen combinations for the joint to be named with them."""
 OTHER_TOOL_MM = 25.0
 """Distance of the shaft's end from its nominal place that no wrist explains: the metal of one is 5 to 20 mm long."""
 TOO_FAR_SIGMA = 4.0
@@ -104,9 +106,9 @@ def estimate_with_kinematics(
     """The same with constant joint offsets, and the clock offset, among the unknowns of `joint`; and what was decided
     about the offsets, in sentences.
 
-    An offset that the data cannot tell from the transform (its sigma stays at its prior) is held at zero: its prior
-    would else be counted as uncertainty of a transform that absorbs it anyway. With `auto` all offsets are left out
-    unless there is strong evidence of them; the covariance then allows for the other possibility.
+    A combination of offsets that the data cannot tell from the transform (its sigma stays at its prior) is held at
+    zero: its prior would else be counted as uncertainty of a transform that absorbs it anyway. With `auto` all offsets
+    are left out unless there is strong evidence of them; the covariance then allows for the other possibility.
 
     Args:
         observations: N motions.
@@ -122,12 +124,19 @@ def estimate_with_kinematics(
     if clock_s is None:
         clock_s = 0.0
         if asked.clock and isinstance(unknowns, KinematicUnknowns) and unknowns.has_clock:
-            clock_s = _clock_start(base, unknowns, config.clock_search_s, sigma)
+            # Whatever is measured: the axis lines tell the clock even where the answer does not use them.
+            lines = Problem.from_observations(observations, device=config.device).only("axis").flatten_batch()
+            clock_s = _clock_start(lines, unknowns, config.clock_search_s, sigma)
     clock_at = sigma.new_full((1,), clock_s)
 
-    def solve_with(sigma: torch.Tensor, alternative: AlternativeModel | None = None) -> Solution:
+    def solve_with(
+        sigma: torch.Tensor, alternative: AlternativeModel | None = None, seen: torch.Tensor | None = None
+    ) -> Solution:
         def kinematics(joint_offset: torch.Tensor, clock_s: torch.Tensor) -> Problem:
-            return unknowns.linearised(base, joint_offset, clock_s, sigma)
+            problem = unknowns.linearised(base, joint_offset, clock_s, sigma)
+            if seen is None or problem.joint_derivative is None:
+                return problem
+            return replace(problem, joint_derivative=problem.joint_derivative @ seen)
 
         start = kinematics(torch.zeros_like(sigma)[None], clock_at)
         return solve_problem(start.take_trials(0), config.solver, kinematics=kinematics, alternative=alternative)
@@ -135,17 +144,16 @@ def estimate_with_kinematics(
     solution = solve_with(sigma)
     if "joint_offset" not in solution.nuisances:
         return solution, ()
-    held = solution.nuisances["joint_offset"].held
-    if bool(held.all()):
-        return solve_with(sigma * 0.0), (
-            _about_offsets(solution.nuisances["joint_offset"], held, unknowns.columns, 0.0),
-        )
-    if bool(held.any()):
-        solution = solve_with(torch.where(held, HELD * sigma, sigma))
-    offsets = solution.nuisances["joint_offset"]
+    offsets, moves = solution.nuisances["joint_offset"], sigma > 0
+    unseen = offsets.unseen
+    if bool(offsets.held.all()):
+        return solve_with(sigma * 0.0), (_about_offsets(offsets, unseen, moves, unknowns.columns, 0.0),)
+    if bool((unseen[moves][:, moves] != 0).any()):
+        solution = solve_with(sigma, seen=_without_directions(unseen, sigma))
+        offsets = solution.nuisances["joint_offset"]
     belief = offsets.log_odds_nominal.new_tensor(asked.joint_offset_belief)
     probability = torch.sigmoid(torch.logit(belief) - offsets.log_odds_nominal)
-    note = _about_offsets(offsets, held, unknowns.columns, float(probability))
+    note = _about_offsets(offsets, unseen, moves, unknowns.columns, float(probability))
     if asked.joint_offsets == "always" or bool(offsets.log_odds_nominal < -STRONG_EVIDENCE):
         return solution, (note,)
     return solve_with(sigma * 0.0, AlternativeModel(solution.camera_right_T_arm, solution.covariance, probability)), (
@@ -153,21 +161,47 @@ def estimate_with_kinematics(
     )
 
 
-def _about_offsets(offsets: Nuisance, held: torch.Tensor, columns: tuple[str, ...], probability: float) -> str:
-    """Whether the encoders have offsets, what would not show, and what is part of the transform."""
+def _without_directions(unseen: Float[Tensor, "j j"], sigma: Float[Tensor, " j"]) -> Float[Tensor, "j j"]:
+    """Matrix that, multiplied to the derivatives of the kinematics, leaves the unseen combinations without effect."""
+    eye = torch.eye(len(sigma), dtype=sigma.dtype, device=sigma.device)
+    return sigma[:, None] * (eye - unseen) / torch.where(sigma > 0, sigma, 1.0)
+
+
+def _about_offsets(
+    offsets: Nuisance, unseen: torch.Tensor, moves: torch.Tensor, columns: tuple[str, ...], probability: float
+) -> str:
+    """Whether the encoders have offsets, what would not show, and what is part of the transform.
+
+    Args:
+        offsets: the estimated ones.
+        unseen: projection onto the combinations that the data do not see, in units of the priors.
+        moves: which joints move the shaft; the others (the wrist's) are no part of anything.
+        columns: name of each joint, with its unit.
+        probability: that there are offsets at all.
+    """
     names = [column.rpartition("_")[0] for column in columns]
-    hidden = ", ".join(name for name, is_held in zip(names, held.tolist(), strict=True) if is_held)
-    if bool(held.all()):
-        return f"Constant joint offsets cannot be told from the transform here, and are part of it ({hidden})."
-    seen = ", ".join(
-        f"{name} {_shown(sigma, column)}"
-        for name, column, sigma, is_held in zip(names, columns, offsets.sigma.tolist(), held.tolist(), strict=True)
-        if not is_held
-    )
-    return (
-        f"Constant joint offsets are {100.0 * probability:.0f} % probable; the data see them to 1 sigma of {seen}"
-        + (f"; those of {hidden} cannot be told from the transform and are part of it." if hidden else ".")
-    )
+    kinds = zip(names, columns, offsets.sigma.tolist(), offsets.held.tolist(), moves.tolist(), strict=True)
+    visible = [(name, column, sigma, is_held) for name, column, sigma, is_held, moved in kinds if moved]
+    hidden = [name for name, _, _, is_held in visible if is_held]
+    if len(hidden) == len(visible):
+        return f"Constant joint offsets cannot be told from the transform here, and are part of it ({_listed(hidden)})."
+    share = unseen.diagonal().tolist()
+    mixed = [
+        name
+        for name, part, is_held, moved in zip(names, share, offsets.held.tolist(), moves.tolist(), strict=True)
+        if moved and not is_held and part > MIXED_SHARE
+    ]
+    seen = ", ".join(f"{name} {_shown(sigma, column)}" for name, column, sigma, is_held in visible if not is_held)
+    note = f"Constant joint offsets are {100.0 * probability:.0f} % probable; the data see them to 1 sigma of {seen}"
+    if hidden:
+        note += f"; those of {_listed(hidden)} cannot be told from the transform and are part of it"
+    if len(mixed) > 1:
+        note += f"; a combination of those of {_listed(mixed)} cannot be told from the transform and is part of it"
+    return f"{note}."
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names)
 
 
 def _shown(sigma: float, column: str) -> str:

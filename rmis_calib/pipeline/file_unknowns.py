@@ -36,7 +36,8 @@ class FileUnknowns:
             raise ObservationsError(where="unknown_displacement", expected="effects of offsets", found="none")
         names = observations.unknown_names.tolist()
         joints = [index for index, name in enumerate(names) if name != CLOCK]
-        effect = torch.as_tensor(observations.unknown_displacement, device=device).mT  # (m, 6, u)
+        # Motions without kinematics are not valid (Problem.from_arrays); they must not spoil the sums either.
+        effect = torch.as_tensor(observations.unknown_displacement, device=device).nan_to_num(nan=0.0).mT  # (m, 6, u)
         at = torch.as_tensor(observations.unknown_at, device=device)
         self.columns = tuple(names[index] for index in joints)
         """`<arm>.<joint>_rad` or `_mm`, as in the file."""

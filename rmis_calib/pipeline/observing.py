@@ -50,7 +50,8 @@ def assemble(
     """
     arrays: dict[str, np.ndarray] = {}
     for view, choice in zip(views, choices, strict=True):
-        floor = config.model_sigma_px / float(recording.stereo.right.focal)
+        camera = recording.stereo.left if view.side == "left" else recording.stereo.right
+        floor = config.model_sigma_px / float((camera or recording.stereo.right).focal)
         arrays |= _measured(view.side, select_frames(view.detections, poses.frames), choice, floor)
     extrinsics = recording.stereo.camera_left_T_camera_right
     return ShaftObservations(

@@ -17,7 +17,7 @@ from rmis_calib.solver.settings import SolverSettings
 from rmis_calib.solver.solution import AlternativeModel, Solution, concatenate, map_tensors
 from rmis_calib.solver.start.candidates import find_candidates
 from rmis_calib.solver.start.line_statistics import LineStatistics
-from rmis_calib.solver.start.paper import average, empirical_covariance, influence, solve_paper
+from rmis_calib.solver.start.paper import average, empirical_covariance, influence, solve_paper, votes
 from rmis_calib.solver.status import MotionReason
 
 GROUP_MOTIONS = 32768
@@ -85,7 +85,10 @@ def _solve_flat(
     if settings.thin_to is not None and settings.thin_to < flat.n_motions:
         index, kept = _informative(flat, settings, settings.thin_to)
         chosen = flat.select_motions(index)
-    fit = map_estimate(chosen, settings) if kinematics is None else solve_relinearised(chosen, settings, kinematics)
+    if kinematics is None:
+        fit = map_estimate(chosen, settings)
+    else:
+        fit = solve_relinearised(chosen, settings, _of_motions(kinematics, index))
     solution = joint_solution(fit, settings, alternative)
     return solution if index is None else replace(_spread(solution, index, flat.n_motions), information_kept=kept)
 
@@ -100,13 +103,21 @@ def _solve_two_step(flat: Problem, settings: SolverSettings, method: str) -> Sol
     part = flat.select_motions(slice(None, None, stride)) if stride > 1 else flat
     if method == "paper":
         R_each, t_each = solve_paper(statistics)
-        R, t = average(R_each, t_each)
-        shares = influence(part, R_each, t_each)
+        weight = votes(statistics.count)
+        R, t = average(R_each, t_each, weight)
+        shares = influence(part, R_each, t_each, weight)
     else:
         R, t, _ = find_candidates(statistics, settings.grid, settings.minima).best()
         shares = influence(part, R[:, None], t[:, None])
     covariance = empirical_covariance(shares) * (part.n_motions / flat.n_motions)
     return two_step_solution(flat, R, t, covariance, settings, method)
+
+
+def _of_motions(kinematics: Kinematics, index: Int[Tensor, " k"] | None) -> Kinematics:
+    """The kinematics of some motions alone."""
+    if index is None:
+        return kinematics
+    return lambda joint_offset, clock_s: kinematics(joint_offset, clock_s).select_motions(index)
 
 
 def _informative(flat: Problem, settings: SolverSettings, count: int) -> tuple[Int[Tensor, " k"], float]:

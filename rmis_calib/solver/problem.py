@@ -253,14 +253,22 @@ class _Reader:
         valid = torch.stack([self._valid(side) for side in self.sides], dim=len(self.batch))
         eye = torch.eye(4, dtype=self.dtype, device=self.device).expand(*self.batch, 4, 4)
         cameras = [eye] + ([self.filled("camera_left_T_camera_right", 4, 4)] if len(self.sides) == 2 else [])
+        self.tensor("rcm_v_axis")  # required
         v = self.filled("rcm_v_axis", self.n, 3)
-        if not bool((torch.linalg.vector_norm(v, dim=-1) > 1e-9).all()):
+        unknown = torch.isnan(self.poses).flatten(-2).any(-1) | torch.isnan(v).any(-1)  # motions without kinematics
+        if bool(unknown.all(-1).any()):
+            raise ObservationsError(where="arm_T_rcm", expected="finite poses", found="NaN in every motion")
+        poses = torch.where(unknown[..., None, None], torch.eye(4, dtype=self.dtype, device=self.device), self.poses)
+        v = torch.where(unknown[..., None], v.new_tensor([0.0, 0.0, 1.0]), v)
+        valid = valid & ~unknown[..., None, :]
+        length = torch.linalg.vector_norm(v, dim=-1)
+        if not bool((torch.isfinite(length) & (length > 1e-9)).all()):
             raise ObservationsError(
-                where="rcm_v_axis", expected="finite unit directions", found="a zero or non-finite one"
+                where="rcm_v_axis", expected="finite unit directions", found="a zero or infinite one"
             )
         return Problem(
-            arm_T_rcm=self.poses,
-            rcm_v_axis=v / torch.linalg.vector_norm(v, dim=-1, keepdim=True),
+            arm_T_rcm=poses,
+            rcm_v_axis=v / length[..., None],
             camera_T_camera_right=torch.stack(cameras, dim=-3),
             axis_xy=axis,
             axis_sigma=self.both("sigma_axis_{}"),

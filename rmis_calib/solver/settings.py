@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
 Positive = Annotated[float, Field(gt=0.0)]
@@ -92,6 +92,16 @@ class VerdictSettings:
     lever_mm: Positive = 50.0
     """Length that turns a rotation into a displacement when directions are ranked: about the visible part of the
     shaft."""
+
+    @model_validator(mode="after")
+    def _in_order(self) -> "VerdictSettings":
+        """`trustworthy` must not reach past `unobservable`: there would be answers that are both."""
+        for unit in ("mm", "deg"):
+            name, other = f"trustworthy_{unit}", f"unobservable_{unit}"
+            least, most = getattr(self, name), getattr(self, other)
+            if least > most:
+                raise ValueError(f"expected {name} at most {other}, found {least:g} and {most:g}")
+        return self
 
 
 @dataclass(frozen=True, config=_STRICT)

@@ -18,8 +18,9 @@ from rmis_calib.solver.status import SolveStatus
 @dataclass(frozen=True)
 class Nuisance:
     """An unknown that was estimated beside the transform: value, 1 sigma, unit, whether the data could not tell it
-    (held), how many sigmas of its prior it was pulled from its nominal value, and the log of the odds, in the light of
-    the data, that all of it is exactly nominal."""
+    (held), how many sigmas of its prior it was pulled from its nominal value, the log of the odds, in the light of the
+    data, that all of it is exactly nominal, and the projection onto its combinations that the data do not see, in units
+    of the priors."""
 
     value: Float[Tensor, "*batch k"]
     sigma: Float[Tensor, "*batch k"]
@@ -27,6 +28,7 @@ class Nuisance:
     held: Bool[Tensor, "*batch k"]
     pull: Float[Tensor, "*batch k"]
     log_odds_nominal: Float[Tensor, "*batch"]
+    unseen: Float[Tensor, "*batch k k"]
 
 
 @dataclass(frozen=True)

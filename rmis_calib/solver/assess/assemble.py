@@ -186,12 +186,32 @@ def _nuisances(fit: MapEstimate, settings: SolverSettings) -> dict[str, Nuisance
             sigma=sigma[:, part],
             unit=UNITS[name],
             held=held,
+            unseen=_unseen(
+                fit.covariance[:, part, part], fit.model.layout.sigma[:, part], settings.unknowns.held_ratio
+            ),
             pull=deviation[:, part] / fit.model.layout.sigma[:, part],
             log_odds_nominal=_log_odds_nominal(
                 deviation[:, part], fit.covariance[:, part, part], fit.model.layout.sigma[:, part]
             ),
         )
     return out
+
+
+def _unseen(
+    covariance: Float[Tensor, "b k k"], prior_sigma: Float[Tensor, "b k"], ratio: float
+) -> Float[Tensor, "b k k"]:
+    """Projection onto the combinations whose sigma the data do not bring below `ratio` of the prior.
+
+    Decided along the principal directions, in units of the prior: two offsets of which only the sum shows are each
+    known to 0.7 of their prior, and their difference not at all.
+    """
+    values, vectors = torch.linalg.eigh(torch.nan_to_num(_in_prior_units(covariance, prior_sigma)))
+    chosen = (values > ratio**2).to(values.dtype)
+    return vectors * chosen[:, None] @ vectors.mT
+
+
+def _in_prior_units(covariance: Float[Tensor, "b k k"], prior_sigma: Float[Tensor, "b k"]) -> Float[Tensor, "b k k"]:
+    return covariance / (prior_sigma[:, :, None] * prior_sigma[:, None])
 
 
 def _log_odds_nominal(
@@ -203,8 +223,7 @@ def _log_odds_nominal(
     a direction of posterior variance p in which the estimate is at x adds -(log p + x^2 / p) / 2: one that the data do
     not see adds nothing, one that they see and find nominal speaks for "nominal".
     """
-    scaled = covariance / (prior_sigma[:, :, None] * prior_sigma[:, None])
-    values, vectors = torch.linalg.eigh(torch.nan_to_num(scaled))
+    values, vectors = torch.linalg.eigh(torch.nan_to_num(_in_prior_units(covariance, prior_sigma)))
     along = (vectors.mT @ (deviation / prior_sigma)[..., None])[..., 0]
     p = values.clamp(1e-12, 1.0)
     return -0.5 * (p.log() + along.square() / p).sum(-1)

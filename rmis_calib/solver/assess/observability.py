@@ -64,7 +64,7 @@ def assess(
         rotation_sigma_deg=rotation,
         sigma_mm=values.flip(-1).clamp_min(0.0).sqrt(),
         directions=vectors.flip(-1).mT,
-        verdict=weak.long() + blind.long() * (1 - weak.long()) + (weak & blind).long(),
+        verdict=torch.where(blind, 2, weak.long()),
         degeneracy=degeneracy,
         shaft_direction=v / torch.linalg.vector_norm(v, dim=-1, keepdim=True).clamp_min(1e-12),
     )

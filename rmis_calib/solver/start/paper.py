@@ -16,6 +16,8 @@ from rmis_calib.solver.start.candidates import solve_translation
 from rmis_calib.solver.start.line_statistics import LineStatistics, plane_normals
 from rmis_calib.solver.start.rotation_search import unvec
 
+MIN_LINES = 8
+"""Axis lines that a camera needs to vote: Eq. 10 has one solution, up to its scale, from the eighth line on."""
 QUATERNION_STEPS = 60
 MAX_QUATERNION_STEP = 0.05
 """Steps stay below 6 degrees, as those of a line search do: the published refinement is a local one. Unbounded
@@ -112,18 +114,36 @@ def solve_paper(statistics: LineStatistics) -> tuple[Float[Tensor, "b c 3 3"], F
     return R, t[:, 0].unflatten(0, R.shape[:2])
 
 
+def votes(count: Float[Tensor, "b c"]) -> Float[Tensor, "b c"]:
+    """Weight of each camera in the average; the weights of a trial add up to 1.
+
+    A camera with fewer than MIN_LINES lines does not vote, since its estimate is any of many solutions. Where no
+    camera has as many, the one with most lines answers alone.
+    """
+    able = (count >= MIN_LINES).to(count.dtype)
+    most = torch.nn.functional.one_hot(count.argmax(-1), count.shape[-1]).to(count.dtype)
+    weight = torch.where(able.any(-1, keepdim=True), able, most)
+    return weight / weight.sum(-1, keepdim=True)
+
+
 def average(
-    R: Float[Tensor, "b c 3 3"], t: Float[Tensor, "b c 3"]
+    R: Float[Tensor, "b c 3 3"], t: Float[Tensor, "b c 3"], weight: Float[Tensor, "b c"]
 ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"]]:
-    """Last line of Algorithm 1: chordal mean of the rotations, mean of the translations."""
-    return chordal_mean(R), t.mean(1)
+    """Last line of Algorithm 1, over the cameras that vote: chordal mean of the rotations, mean of the translations."""
+    R = torch.where(weight[..., None, None] > 0, R, 0.0)  # an estimate from no line at all may be NaN
+    return chordal_mean(R, weight), (weight[..., None] * torch.where(weight[..., None] > 0, t, 0.0)).sum(1)
 
 
-def influence(problem: Problem, R: Float[Tensor, "b c 3 3"], t: Float[Tensor, "b c 3"]) -> Float[Tensor, "b n 6"]:
+def influence(
+    problem: Problem,
+    R: Float[Tensor, "b c 3 3"],
+    t: Float[Tensor, "b c 3"],
+    weight: Float[Tensor, "b c"] | None = None,
+) -> Float[Tensor, "b n 6"]:
     """Each motion's share in the error of the two-step estimate (rotation, then translation).
 
-    With one R and t a camera (c > 1), each camera's own estimate from its own lines, and the mean of their shares; with
-    c = 1, one estimate from the lines of all cameras.
+    With one R and t a camera (c > 1), each camera's own estimate from its own lines, and the mean of their shares by
+    `weight` (of `votes`); with c = 1, one estimate from the lines of all cameras.
 
     The estimate solves sum psi_1 = 0, psi_1 = (R v x n)(n.R v), and sum psi_2 = 0, psi_2 = n (n.(R p + t + o)). To
     first order the error is -A^-1 sum psi with A the block-triangular derivative: dphi = -H1^-1 sum psi_1, dt = -H2^-1
@@ -151,7 +171,11 @@ def influence(problem: Problem, R: Float[Tensor, "b c 3 3"], t: Float[Tensor, "b
     shift = -torch.linalg.solve(
         H2 + eye * H2.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None], (psi2 + phi @ B.mT).mT
     ).mT
-    return torch.cat((phi, shift), dim=-1).unflatten(0, (b, estimates)).mean(1)
+    shares = torch.cat((phi, shift), dim=-1).unflatten(0, (b, estimates))
+    if weight is None:
+        return shares.mean(1)
+    weight = weight[..., None, None]
+    return (weight * torch.where(weight > 0, shares, 0.0)).sum(1)
 
 
 def _outer(a: Float[Tensor, "b c n 3"], b: Float[Tensor, "b c n 3"]) -> Float[Tensor, "b 3 3"]:
