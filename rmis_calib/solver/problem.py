@@ -258,8 +258,12 @@ class _Reader:
         unknown = torch.isnan(self.poses).flatten(-2).any(-1) | torch.isnan(v).any(-1)  # motions without kinematics
         if bool(unknown.all(-1).any()):
             raise ObservationsError(where="arm_T_rcm", expected="finite poses", found="NaN in every motion")
-        poses = torch.where(unknown[..., None, None], torch.eye(4, dtype=self.dtype, device=self.device), self.poses)
-        v = torch.where(unknown[..., None], v.new_tensor([0.0, 0.0, 1.0]), v)
+        # They take the place of the first known motion, where they change nothing that is told from the poses.
+        first = (~unknown).int().argmax(-1, keepdim=True)
+        poses = torch.where(
+            unknown[..., None, None], torch.take_along_dim(self.poses, first[..., None, None], -3), self.poses
+        )
+        v = torch.where(unknown[..., None], torch.take_along_dim(v, first[..., None], -2), v)
         valid = valid & ~unknown[..., None, :]
         length = torch.linalg.vector_norm(v, dim=-1)
         if not bool((torch.isfinite(length) & (length > 1e-9)).all()):

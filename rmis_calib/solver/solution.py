@@ -172,4 +172,5 @@ def _nuisance(name: str, group: Solution, groups: list[Solution]) -> Nuisance:
         return group.nuisances[name]
     other = next(each.nuisances[name] for each in groups if name in each.nuisances)
     empty = other.value.new_full((len(group.status), other.value.shape[-1]), torch.nan)
-    return Nuisance(empty, empty, other.unit, torch.ones_like(empty, dtype=torch.bool), empty, empty[:, 0])
+    none_seen = torch.eye(empty.shape[-1], dtype=empty.dtype, device=empty.device).repeat(len(empty), 1, 1)
+    return Nuisance(empty, empty, other.unit, torch.ones_like(empty, dtype=torch.bool), empty, empty[:, 0], none_seen)

@@ -54,6 +54,7 @@ def refine_quaternion(gram: Float[Tensor, "b 9 9"], R: Float[Tensor, "b 3 3"]) -
     eye = torch.eye(4, dtype=q.dtype, device=q.device)
     cost, gradient, curvature = quaternion_derivatives(gram, q)
     damping = torch.full_like(cost, 1e-9)
+    active = torch.ones_like(cost, dtype=torch.bool)
     for _ in range(QUATERNION_STEPS):
         radial = q[:, :, None] * q[:, None]
         tangent = eye - radial
@@ -64,10 +65,10 @@ def refine_quaternion(gram: Float[Tensor, "b 9 9"], R: Float[Tensor, "b 3 3"]) -
         step = step * (MAX_QUATERNION_STEP / length.clamp_min(MAX_QUATERNION_STEP))
         proposal = torch.nn.functional.normalize(q + step, dim=-1)
         new_cost, new_gradient, new_curvature = quaternion_derivatives(gram, proposal)
-        better = new_cost <= cost
-        moving = (step.abs().amax(-1) > QUATERNION_TOLERANCE) & (damping < MAX_QUATERNION_DAMPING)
+        better = active & (new_cost <= cost)  # an estimate that has settled does not wait for those beside it
+        active = active & (step.abs().amax(-1) > QUATERNION_TOLERANCE) & (damping < MAX_QUATERNION_DAMPING)
         q = torch.where(better[:, None], proposal, q)
-        if not bool(moving.any()):
+        if not bool(active.any()):
             break
         cost = torch.where(better, new_cost, cost)
         gradient = torch.where(better[:, None], new_gradient, gradient)
