@@ -69,11 +69,13 @@ def quat_to_rotvec(quat: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3"]
 
 def quat_to_matrix(quat: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrix of a quaternion (w, x, y, z), not zero; its length does not matter."""
-    w, x, y, z = (quat / quat.norm(dim=-1, keepdim=True)).unbind(-1)
+    q = quat / quat.norm(dim=-1, keepdim=True)
+    w, x, y, z = q.unbind(-1)
+    x2, y2, z2 = (q + q)[..., 1:].unbind(-1)  # not 2 * q: torch has no forward-mode rule for that, only a slow detour
     rows = [
-        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+        *(1 - (y * y2 + z * z2), x * y2 - w * z2, x * z2 + w * y2),
+        *(x * y2 + w * z2, 1 - (x * x2 + z * z2), y * z2 - w * x2),
+        *(x * z2 - w * y2, y * z2 + w * x2, 1 - (x * x2 + y * y2)),
     ]
     return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
 

@@ -1,18 +1,5 @@
 """Forward kinematics of both arms from their Denavit-Hartenberg tables, batched and differentiable."""
 
-from rmis_calib._lazy import lazy_exports
+import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_exports(
-    __name__,
-    {
-        "JointRow": ".dh",
-        "build_chain": ".dh",
-        "dh_matrix": ".dh",
-        "frame_poses": ".dh",
-        "ArmTable": ".arms",
-        "HeadPointTable": ".arms",
-        "InstrumentPose": ".arms",
-        "RobotKinematics": ".arms",
-        "RobotTable": ".arms",
-    },
-)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

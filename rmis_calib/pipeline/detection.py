@@ -146,7 +146,7 @@ def detect_recording(
 ) -> tuple[View, ...]:
     """The right view, and the left one of a stereo recording."""
     rig = recording.stereo
-    views = {"right": (recording.right, rig.right)}
+    views: dict[str, tuple[FrameSource, Camera | None]] = {"right": (recording.right, rig.right)}
     if recording.left is not None:
         views["left"] = (recording.left, rig.left)
     sources = {side: source for side, (source, _) in views.items()}

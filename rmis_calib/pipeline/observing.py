@@ -1,5 +1,7 @@
 """Detections and kinematics to the solver's observations."""
 
+from typing import Any
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -48,7 +50,7 @@ def assemble(
         choices: candidate of every motion, one entry a view.
         config: what the pictures leave out.
     """
-    arrays: dict[str, np.ndarray] = {}
+    arrays: dict[str, Any] = {}
     for view, choice in zip(views, choices, strict=True):
         camera = recording.stereo.left if view.side == "left" else recording.stereo.right
         floor = config.model_sigma_px / float((camera or recording.stereo.right).focal)
@@ -66,7 +68,7 @@ def assemble(
     )
 
 
-def head_observations(recording: Recording, poses: MotionPoses) -> dict[str, np.ndarray]:
+def head_observations(recording: Recording, poses: MotionPoses) -> dict[str, Any]:
     """Labelled head points as normalised undistorted coordinates, NaN where there is none."""
     points = recording.head_points
     if points is None:

@@ -5,13 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from rmis_calib.geometry.rotations import quat_to_matrix, random_quat, rotation_angle
+from rmis_calib.geometry.rotations import rotation_angle
 from rmis_calib.solver import LineStatistics, Problem, SolverSettings, SolveStatus, Verdict, solve
 from rmis_calib.solver.observability import VERDICTS
 from rmis_calib.solver.settings import NoiseSettings, UnknownSettings
 from rmis_calib.solver.solution import concatenate
-from rmis_calib.solver.start.paper import linear_rotation, quaternion_derivatives, solve_paper
-from rmis_calib.solver.start.rotation_search import vec
+from rmis_calib.solver.start.paper import linear_rotation, solve_paper
 
 EXACT = UnknownSettings(radius_sigma_relative=0.0)
 
@@ -114,23 +113,6 @@ def test_radius_and_end_offset_are_estimated_with_their_sigma(simulate, realisti
     assert not bool(radius.held.any())
     _, mm = error(solution, truth)
     assert bool((mm < 3.5 * solution.translation_sigma_mm).all())
-
-
-def test_quaternion_derivatives_equal_autograd():
-    """On the tangent space of the unit sphere, where alone they are used."""
-    generator = torch.Generator().manual_seed(4)
-    A = torch.randn(3, 20, 9, generator=generator, dtype=torch.float64)
-    gram = A.mT @ A
-    q = random_quat((3,), generator=generator).requires_grad_(True)
-    r = vec(quat_to_matrix(q))
-    expected_cost = ((r[:, None] @ gram)[:, 0] * r).sum(-1)
-    (expected,) = torch.autograd.grad(expected_cost.sum(), q)
-    cost, gradient, curvature = quaternion_derivatives(gram, q.detach())
-    tangent = torch.eye(4, dtype=torch.float64) - q.detach()[:, :, None] * q.detach()[:, None]
-    torch.testing.assert_close(cost, expected_cost.detach())
-    torch.testing.assert_close((tangent @ gradient[..., None])[..., 0], expected)
-    J = torch.func.vmap(torch.func.jacrev(lambda x: vec(quat_to_matrix(x))))(q.detach())
-    torch.testing.assert_close(tangent @ curvature @ tangent, 2.0 * J.mT @ gram @ J)
 
 
 @pytest.mark.parametrize("method", ["global", "joint"])

@@ -87,7 +87,7 @@ def map_estimate(problem: Problem, settings: SolverSettings, start: "MapEstimate
     Raises:
         InsufficientDataError: fewer measured rows than unknowns in some trial.
     """
-    measured = pack(problem, settings.noise)
+    measured = replace(pack(problem, settings.noise), autograd=settings.derivatives == "autograd")
     assumed, free = assumed_noise(problem, settings.noise)
     generator = torch.Generator().manual_seed(settings.seed)
     order = torch.randperm(measured.motions, generator=generator).to(measured.p.device)

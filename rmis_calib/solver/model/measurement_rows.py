@@ -40,6 +40,7 @@ class MeasurementRows:
         camera_t: its translation.
         joint: displacement of the shaft per unit of joint offset, in `arm`; None where unknown.
         clock: displacement per second, in `arm`.
+        autograd: whether `residuals.linearise` takes the derivatives from autograd.
     """
 
     p: Float[Tensor, "3 b n"]
@@ -61,6 +62,7 @@ class MeasurementRows:
     camera_t: Float[Tensor, "3 c b"]
     joint: Float[Tensor, "6 j b n"] | None = None
     clock: Float[Tensor, "6 b n"] | None = None
+    autograd: bool = False
 
     @property
     def trials(self) -> int:
@@ -117,15 +119,14 @@ class MeasurementRows:
             value = getattr(self, field.name)
             if field.name in ("camera_R", "camera_t"):
                 part[field.name] = value[..., trials]
-            elif value is not None:
+            elif isinstance(value, Tensor):
                 part[field.name] = value[..., trials, motions]
         return replace(self, **part)
 
     def take_motions(self, index: Tensor) -> "MeasurementRows":
         """The part of the motions `index`, the same for every trial."""
-        names = [
-            f.name for f in fields(self) if f.name not in ("camera_R", "camera_t") and getattr(self, f.name) is not None
-        ]
+        fixed = ("camera_R", "camera_t")
+        names = [f.name for f in fields(self) if f.name not in fixed and isinstance(getattr(self, f.name), Tensor)]
         return replace(self, **{name: getattr(self, name)[..., index] for name in names})
 
     def gather(self, trial: Tensor, motion: Tensor) -> "MeasurementRows":
@@ -135,7 +136,7 @@ class MeasurementRows:
             value = getattr(self, field.name)
             if field.name in ("camera_R", "camera_t"):
                 part[field.name] = value[..., trial]
-            elif value is not None:
+            elif isinstance(value, Tensor):
                 part[field.name] = value[..., trial, motion][..., None]
         return replace(self, **part)
 
@@ -144,7 +145,7 @@ class MeasurementRows:
         part = {}
         for field in fields(self):
             value = getattr(self, field.name)
-            if value is not None:
+            if isinstance(value, Tensor):
                 dim = value.ndim - (1 if field.name in ("camera_R", "camera_t") else 2)
                 part[field.name] = value.index_select(dim, index)
         return replace(self, **part)

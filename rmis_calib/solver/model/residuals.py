@@ -40,12 +40,15 @@ So every nuisance and every noise source costs scalar products only. `tests/solv
 of this against `torch.func.jacrev`.
 """
 
+import warnings
 from dataclasses import dataclass, fields, replace
 
 import torch
+import torch.autograd.forward_ad as forward_ad
 from jaxtyping import Float
 from torch import Tensor
 
+from rmis_calib.errors import InputError
 from rmis_calib.geometry.rotations import rotvec_to_matrix
 from rmis_calib.solver.model.batched_linalg import cross, dot, rotate_trials, unit
 from rmis_calib.solver.model.measurement_rows import MeasurementRows
@@ -188,10 +191,13 @@ def predict_shaft(measured: MeasurementRows, state: State) -> Shaft:
     t = (camera_R @ state.t[:, None, :, None])[..., 0] + camera_t
     p = rotate_trials(R, arm_p) + t.permute(2, 1, 0)[..., None]
     d = rotate_trials(R, arm_v)
+    return _shaft(p, d, rotate_trials(R, arm_head) if measured.has_heads else d)
+
+
+def _shaft(p: Float[Tensor, "3 c b n"], d: Float[Tensor, "3 c b n"], head: Float[Tensor, "3 c b n"]) -> Shaft:
     M = cross(p, d)
     D = dot(M, M).sqrt().clamp_min(1e-9)
     s0 = dot(p, d)
-    head = rotate_trials(R, arm_head) if measured.has_heads else d
     return Shaft(p=p, d=d, m=M / D, u=torch.addcmul(p, s0, d, value=-1.0) / D, D=D, s0=s0, head=head)
 
 
@@ -216,10 +222,16 @@ def _corrected(measured: MeasurementRows, state: State) -> tuple[Tensor, Tensor,
 
 def residual_rows(measured: MeasurementRows, state: State) -> Float[Tensor, "k b n"]:
     """Residuals alone."""
-    shaft = predict_shaft(measured, state)
-    parts = [_line_geometry(measured, state, shaft).f.flatten(0, 1)]
+    return _rows(measured, state, predict_shaft(measured, state))
+
+
+def _rows(
+    measured: MeasurementRows, state: State, shaft: Shaft, radius: Tensor | float = 0.0, end: Tensor | float = 0.0
+) -> Tensor:
+    """Residuals of a shaft, its radius and end moved by so much."""
+    parts = [_line_geometry(measured, state, shaft, radius).f.flatten(0, 1)]
     if measured.has_ends:
-        parts.append(_end_geometry(measured, state, shaft)[0])
+        parts.append(_end_geometry(measured, state, shaft, end)[0])
     if measured.has_heads:
         parts.append(_head_geometry(measured, shaft)[0].flatten(0, 1))
     return torch.where(measured.rows_ok, torch.cat(parts), 0.0)
@@ -232,6 +244,8 @@ def linearise(measured: MeasurementRows, state: State) -> tuple[LinearisedRows, 
     are combinations of the axes m, u and d, which alone are turned into `camera_right`.
     """
     shaft = predict_shaft(measured, state)
+    if measured.autograd:
+        return _linearise_by_autograd(measured, state, shaft), shaft
     camera_R, _ = camera_poses(measured, state)
     m, u, d = _into_right(camera_R, torch.stack((shaft.m, shaft.u, shaft.d), dim=1)).unsqueeze(2).unbind(1)
     lines, c = measured.line_xy.shape[1], measured.cameras
@@ -267,6 +281,40 @@ def linearise(measured: MeasurementRows, state: State) -> tuple[LinearisedRows, 
     return LinearisedRows(r=r, w=w, a=a, radius=radius, end=end), shaft
 
 
+def _linearise_by_autograd(measured: MeasurementRows, state: State, shaft: Shaft) -> LinearisedRows:
+    """The same effects from forward-mode autograd, in one pass.
+
+    Each row depends on its own motion alone, so a step of all shafts at once gives a column of all rows. The eight
+    steps (three of a translation, three of a rotation, radius, end) stand side by side as trials.
+    """
+    steps, b = 8, measured.trials
+    index = torch.arange(b, device=shaft.D.device).repeat(steps)
+    camera_R = camera_poses(measured, state)[0][index]
+    many, at, p, d, head = measured.take_trials(index), state.take(index), *_of_trials(index, shaft)
+    zero = shaft.D.new_zeros((steps, steps * b, measured.motions))
+    tangent = torch.eye(steps, dtype=zero.dtype, device=zero.device).repeat_interleave(b, dim=1)[..., None]
+
+    def rows(step: Float[Tensor, "8 b n"]) -> Float[Tensor, "k b n"]:
+        tau, phi = rotate_trials(camera_R, step[:3]), rotate_trials(camera_R, step[3:6])
+        moved = _shaft(p + tau, d + cross(phi, d), head + cross(phi, head))
+        return _rows(many, at, moved, step[6], step[7])
+
+    with warnings.catch_warnings():  # torch warns of what it does itself when its rules load
+        warnings.simplefilter("ignore", DeprecationWarning)
+        with torch.inference_mode(False), torch.no_grad(), forward_ad.dual_level():
+            dual = forward_ad.make_dual(zero.clone(), tangent.expand_as(zero).clone())
+            effect = forward_ad.unpack_dual(rows(dual)).tangent
+            if effect is None:
+                raise InputError(where="residuals", expected="rows that depend on the shaft", found="none")
+            effect = torch.where(many.rows_ok, effect, 0.0).unflatten(1, (steps, b)).transpose(0, 1)
+    return LinearisedRows(_rows(measured, state, shaft), effect[:3], effect[3:6], effect[6], effect[7])
+
+
+def _of_trials(index: Tensor, shaft: Shaft) -> tuple[Tensor, Tensor, Tensor]:
+    """p, d and head of these trials."""
+    return shaft.p[:, :, index], shaft.d[:, :, index], shaft.head[:, :, index]
+
+
 def _into_right(camera_R: Float[Tensor, "b c 3 3"], v: Float[Tensor, "3 m c b n"]) -> Float[Tensor, "3 m c b n"]:
     """Vectors of each camera's frame turned into `camera_right`."""
     back = camera_R.permute(1, 0, 3, 2).expand(v.shape[1], -1, -1, -1, -1).flatten(0, 2)
@@ -292,12 +340,12 @@ class LineGeometry:
     n_image: Float[Tensor, "2 l c b n"]
 
 
-def _line_geometry(measured: MeasurementRows, state: State, shaft: Shaft) -> LineGeometry:
+def _line_geometry(measured: MeasurementRows, state: State, shaft: Shaft, radius: Tensor | float = 0.0) -> LineGeometry:
     x, y = measured.line_xy.unbind()
-    sine = (measured.line_rho * (state.radius[:, None] / shaft.D)).clamp(-MAX_SINE, MAX_SINE)
+    sine = (measured.line_rho * ((state.radius[:, None] + radius) / shaft.D)).clamp(-MAX_SINE, MAX_SINE)
     cosine = (1.0 - sine.square()).sqrt()
     n_image = torch.addcmul(cosine * shaft.m[:2, None], sine, shaft.u[:2, None])
-    n_xy = n_image.square().sum(0).sqrt().clamp_min(1e-12)
+    n_xy = _held(n_image.square().sum(0).sqrt().clamp_min(1e-12))
     X_m, X_u, X_d = (_along(axis, x, y) for axis in (shaft.m, shaft.u, shaft.d))
     f = torch.addcmul(cosine * X_m, sine, X_u) / n_xy
     if bool((state.edge_bias != 0).any()):
@@ -312,7 +360,14 @@ def _along(axis: Float[Tensor, "3 c b n"], x: Float[Tensor, "*l c b n"], y: Floa
     return torch.addcmul(torch.addcmul(third, first, x), second, y)
 
 
-def _end_geometry(measured: MeasurementRows, state: State, shaft: Shaft) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _held(value: Tensor) -> Tensor:
+    """The value without its derivative, which is of second order at a small residual (see the top of this file)."""
+    return value.detach()
+
+
+def _end_geometry(
+    measured: MeasurementRows, state: State, shaft: Shaft, end: Tensor | float = 0.0
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """e, chi, s_e and d e / d s_e without its sign, all (c, b, n)."""
     x, y = measured.end_xy.unbind()
     u, d, m = shaft.u, shaft.d, shaft.m
@@ -323,9 +378,12 @@ def _end_geometry(measured: MeasurementRows, state: State, shaft: Shaft) -> tupl
     m_xy = image_m.square().sum(0).sqrt().clamp_min(1e-12)
     step = d[:2] - chi * u[:2]
     across = torch.addcmul(step[1] * image_m[0], step[0], image_m[1], value=-1.0)
-    slope = (across / m_xy).abs().clamp_min(1e-12) / X_u.abs()
-    s_end = (measured.s_end + state.end_offset[:, None]).expand_as(chi)
-    return (chi - (shaft.s0 + s_end) / shaft.D) / slope, chi, s_end, (shaft.D * slope).reciprocal()
+    slope = _held((across / m_xy).abs().clamp_min(1e-12) / X_u.abs())
+    s_end = (measured.s_end + state.end_offset[:, None] + end).expand_as(chi)
+    gain = (shaft.D * slope).reciprocal()
+    if measured.autograd:  # the same value; its derivative is that of the predicted end, seen from a held direction
+        return -dot(_held(d - chi * u), shaft.p + s_end * d) * _held(gain), chi, s_end, gain
+    return (chi - (shaft.s0 + s_end) / shaft.D) / slope, chi, s_end, gain
 
 
 def _head_geometry(measured: MeasurementRows, shaft: Shaft) -> tuple[Tensor, Tensor]:

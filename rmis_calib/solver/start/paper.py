@@ -4,27 +4,26 @@ Paper, Algorithm 1: each camera gives an estimate of its own of the same unknown
 Eq. 8), and the two are averaged. Everything works on sums over motions (line_statistics.py).
 """
 
-from functools import lru_cache
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from rmis_calib.geometry.rotations import chordal_mean, matrix_to_quat, project_to_so3, quat_to_matrix
+from rmis_calib.solver.model.pose_refinement import refine
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.start.candidates import solve_translation
 from rmis_calib.solver.start.line_statistics import LineStatistics, plane_normals
-from rmis_calib.solver.start.rotation_search import unvec
+from rmis_calib.solver.start.rotation_search import unvec, vec
 
 MIN_LINES = 8
 """Axis lines that a camera needs to vote: Eq. 10 has one solution, up to its scale, from the eighth line on."""
 QUATERNION_STEPS = 60
-MAX_QUATERNION_STEP = 0.05
+MAX_TURN_RAD = 0.1
 """Steps stay below 6 degrees, as those of a line search do: the published refinement is a local one. Unbounded
 Gauss-Newton steps leap from the wrong basin, into which the linear start falls at c = 0.5 already (164 degrees off), to
 the right one in about nine of ten trials; that is luck, and `global` does it by search."""
 QUATERNION_TOLERANCE = 1e-7
-MAX_QUATERNION_DAMPING = 1e3
+"""rad; the last step taken is the square of that."""
 
 
 def linear_rotation(gram: Float[Tensor, "b 9 9"]) -> Float[Tensor, "b 3 3"]:
@@ -47,64 +46,24 @@ def linear_rotation(gram: Float[Tensor, "b 9 9"]) -> Float[Tensor, "b 3 3"]:
 def refine_quaternion(gram: Float[Tensor, "b 9 9"], R: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 3"]:
     """Eqs. 14 to 17: minimise sum (n.R(q) v)^2 over the unit quaternion.
 
-    The gradient is analytic and the curvature Gauss and Newton's, both on the tangent space of the unit sphere; q is
-    renormalised after each step, and a step that does not lower the cost is damped.
+    With the Gram matrix as F^T F the sum is |F vec(R)|^2: nine residuals, whatever the number of motions.
     """
-    q = matrix_to_quat(R)
-    eye = torch.eye(4, dtype=q.dtype, device=q.device)
-    cost, gradient, curvature = quaternion_derivatives(gram, q)
-    damping = torch.full_like(cost, 1e-9)
-    active = torch.ones_like(cost, dtype=torch.bool)
-    for _ in range(QUATERNION_STEPS):
-        radial = q[:, :, None] * q[:, None]
-        tangent = eye - radial
-        size = curvature.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]
-        system = tangent @ curvature @ tangent + size * (radial + damping[:, None, None] * eye)
-        step = -torch.linalg.solve(system, (tangent @ gradient[..., None]))[..., 0]
-        length = torch.linalg.vector_norm(step, dim=-1, keepdim=True)
-        step = step * (MAX_QUATERNION_STEP / length.clamp_min(MAX_QUATERNION_STEP))
-        proposal = torch.nn.functional.normalize(q + step, dim=-1)
-        new_cost, new_gradient, new_curvature = quaternion_derivatives(gram, proposal)
-        better = active & (new_cost <= cost)  # an estimate that has settled does not wait for those beside it
-        active = active & (step.abs().amax(-1) > QUATERNION_TOLERANCE) & (damping < MAX_QUATERNION_DAMPING)
-        q = torch.where(better[:, None], proposal, q)
-        if not bool(active.any()):
-            break
-        cost = torch.where(better, new_cost, cost)
-        gradient = torch.where(better[:, None], new_gradient, gradient)
-        curvature = torch.where(better[:, None, None], new_curvature, curvature)
-        damping = torch.where(better, damping * 0.1, damping.clamp_min(1e-4) * 10.0).clamp_min(1e-9)
-    return quat_to_matrix(q)
+    values, vectors = torch.linalg.eigh(gram)
+    factor = values.clamp_min(0.0).sqrt()[..., None] * vectors.mT
 
+    def residual(q: Float[Tensor, "*k b 4"], _: Tensor) -> Float[Tensor, "*k b 9"]:
+        return (factor @ vec(quat_to_matrix(q))[..., None])[..., 0]
 
-def quaternion_derivatives(
-    gram: Float[Tensor, "b 9 9"], q: Float[Tensor, "b 4"]
-) -> tuple[Float[Tensor, " b"], Float[Tensor, "b 4"], Float[Tensor, "b 4 4"]]:
-    """Cost r^T M r of r = vec(R(q)) at unit q, its gradient, and its Gauss-Newton curvature.
-
-    The homogeneous form of R(q), which is R(q) on the unit sphere, is quadratic: its Jacobian J is linear in q, and
-    r = J q / 2 (Euler). So with P = J^T M J the cost is q^T P q / 4, the gradient P q and the curvature 2 P. Off the
-    tangent space of the sphere they differ from those of R(q / |q|), which has no slope there.
-    """
-    J = (q @ _quaternion_map(q.dtype, q.device)).unflatten(-1, (9, 4))
-    P = J.mT @ gram @ J
-    gradient = (P @ q[..., None])[..., 0]
-    return 0.25 * (q * gradient).sum(-1), gradient, 2.0 * P
-
-
-@lru_cache(maxsize=4)
-def _quaternion_map(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "4 36"]:
-    """d vec(R(q)) / dq of the homogeneous form, (9, 4) row by row, as a linear function of q = (w, x, y, z)."""
-    signs = (  # entry (row of vec(R), column): component of q, 1 to 4 for w to z, with its sign
-        (1, 2, -3, -4), (4, 3, 2, 1), (-3, 4, -1, 2),
-        (-4, 3, 2, -1), (1, -2, 3, -4), (2, 1, 4, 3),
-        (3, 4, 1, 2), (-2, -1, 4, 3), (1, -2, -3, 4),
-    )  # fmt: skip
-    out = torch.zeros(4, 9, 4, dtype=dtype, device=device)
-    for i, row in enumerate(signs):
-        for j, component in enumerate(row):
-            out[abs(component) - 1, i, j] = 2.0 if component > 0 else -2.0
-    return out.flatten(1)
+    found = refine(
+        residual,
+        matrix_to_quat(R),
+        R.new_zeros((*R.shape[:-2], 3)),
+        free="rotation",
+        max_iterations=QUATERNION_STEPS,
+        tolerance=QUATERNION_TOLERANCE,
+        max_turn_rad=MAX_TURN_RAD,
+    )
+    return quat_to_matrix(found.quaternion)
 
 
 def solve_paper(statistics: LineStatistics) -> tuple[Float[Tensor, "b c 3 3"], Float[Tensor, "b c 3"]]:

@@ -1,0 +1,31 @@
+from . import residuals as residuals
+from .config import CalibrationConfig as CalibrationConfig
+from .config import load_config as load_config
+from .errors import CalibrationFailed as CalibrationFailed
+from .errors import InputError as InputError
+from .errors import RmisCalibError as RmisCalibError
+from .geometry import RigidTransform as RigidTransform
+from .io import Recording as Recording
+from .io import ShaftObservations as ShaftObservations
+from .io import load_recording as load_recording
+from .pipeline import (
+    calibrate as calibrate,
+)
+from .pipeline import (
+    detect as detect,
+)
+from .pipeline import (
+    evaluate as evaluate,
+)
+from .pipeline import (
+    run_calibration as run_calibration,
+)
+from .pipeline import (
+    solve as solve,
+)
+from .results import CalibrationResult as CalibrationResult
+from .solver.model.pose_refinement import Refinement as Refinement
+from .solver.model.pose_refinement import refine as refine
+from .vision import ShaftDetector as ShaftDetector
+
+__version__: str

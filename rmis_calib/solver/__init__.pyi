@@ -1,0 +1,9 @@
+from .api import solve as solve
+from .observability import Verdict as Verdict
+from .problem import NoiseLevels as NoiseLevels
+from .problem import Problem as Problem
+from .settings import SolverSettings as SolverSettings
+from .solution import Solution as Solution
+from .start.line_statistics import LineStatistics as LineStatistics
+from .status import MotionReason as MotionReason
+from .status import SolveStatus as SolveStatus

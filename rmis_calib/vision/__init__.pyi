@@ -1,0 +1,10 @@
+from .detections import FrameReason as FrameReason
+from .detections import ShaftDetections as ShaftDetections
+from .detector import ShaftDetector as ShaftDetector
+from .draw.overlay import draw_detections as draw_detections
+from .draw.overlay import draw_dot as draw_dot
+from .draw.overlay import draw_polyline as draw_polyline
+from .draw.stage_sheet import draw_stage_sheet as draw_stage_sheet
+from .draw.stages import draw_stages as draw_stages
+from .masks import load_segmenter as load_segmenter
+from .settings import DetectorSettings as DetectorSettings
