@@ -15,7 +15,7 @@ import pytest
 import data_synth
 from rmis_calib.cli import main
 
-COUNT = int(os.environ.get("RMIS_FUZZ", "500"))
+COUNT = int(os.environ.get("RMIS_FUZZ", "400"))
 GROUPS = 20
 TEXTS = ("recording.yaml", "stereo.yaml", "robot.yaml", "joints.csv", "frame_times.csv", "head_points.csv")
 MOST_SECONDS, MOST_BYTES = 60.0, 2 << 30

@@ -7,7 +7,7 @@ Source: Levenberg (1944), Marquardt (1963); Nocedal & Wright, Numerical Optimiza
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal
 
@@ -65,6 +65,7 @@ def refine(
     max_iterations: int = 50,
     tolerance: float = 1e-9,
     max_turn_rad: float = torch.inf,
+    differentiable: bool = False,
 ) -> Refinement:
     """Minimise the sum of squared residuals over poses; every pose of the batch on its own.
 
@@ -76,6 +77,10 @@ def refine(
         max_iterations: steps of a pose at most.
         tolerance: settled where a step turns by less (rad) and shifts by less (times 1 + |t|).
         max_turn_rad: longest turn of one step.
+        differentiable: whether `quaternion` and `translation` pass gradients to the tensors that `residual_fn` closes
+            over, by implicit differentiation at the minimum: whatever the number of steps, one linear solve of the full
+            Hessian. `residual_fn` must then be twice differentiable. Gradients of poses that are not CONVERGED mean
+            nothing.
 
     Returns:
         The poses with a status each. A pose that is not finite, or whose residuals do not see some direction, is data
@@ -95,7 +100,26 @@ def refine(
     _load_forward_mode()
     with torch.inference_mode(False), torch.no_grad():
         q, t = torch.nn.functional.normalize(quaternion, dim=-1).clone(), translation.clone()
-        return _minimise(residual_fn, q, t, free, max_iterations, tolerance, max_turn_rad)
+        found = _minimise(residual_fn, q, t, free, max_iterations, tolerance, max_turn_rad)
+    return _attached(residual_fn, found, free) if differentiable else found
+
+
+def _attached(residual_fn: Residual, found: Refinement, free: Free) -> Refinement:
+    """The same poses as functions of the data.
+
+    At the minimum the gradient g(x, data) of half the cost vanishes, so dx = -H^-1 (dg/d data), H the full Hessian
+    (implicit function theorem). A Newton step from there is that function: its value is zero to rounding, its
+    derivative is dx.
+    """
+    q, t, k = found.quaternion, found.translation, found.information.shape[-1]
+    with torch.inference_mode(False), torch.enable_grad():
+        step = torch.zeros((*q.shape[:-1], k), dtype=q.dtype, device=q.device, requires_grad=True)
+        half_cost = 0.5 * residual_fn(*_moved(q, t, step, free)).square().sum()
+        (gradient,) = torch.autograd.grad(half_cost, step, create_graph=True)
+        rows = [torch.autograd.grad(gradient[..., i].sum(), step, retain_graph=True)[0] for i in range(k)]
+        newton = -torch.linalg.solve_ex(torch.stack(rows, dim=-2).detach(), gradient[..., None]).result[..., 0]
+        q, t = _moved(q, t, newton, free)
+    return replace(found, quaternion=q, translation=t)
 
 
 @cache

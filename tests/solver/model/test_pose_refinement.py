@@ -65,6 +65,32 @@ def test_what_is_held_stays(free):
     assert found.information.shape == (3, 3, 3)
 
 
+@pytest.mark.parametrize("free", ["rotation", "translation", "both"])
+def test_gradients_pass_through_the_minimum(free):
+    """Against finite differences of the whole refinement, with residuals that do not vanish."""
+    x, y, q, t = points(trials=2, count=5)
+    generator = torch.Generator().manual_seed(3)
+    y = y + 2.0 * torch.randn(y.shape, generator=generator, dtype=torch.float64)
+
+    def answer(x, y, differentiable=True):
+        found = rc.refine(alignment(x, y), q, t, free=free, tolerance=1e-12, differentiable=differentiable)
+        return torch.cat((quat_to_matrix(found.quaternion).flatten(-2), found.translation), dim=-1)
+
+    torch.testing.assert_close(answer(x, y), answer(x, y, False), rtol=0, atol=1e-7)
+    weight = torch.randn((2, 12), generator=generator, dtype=torch.float64)
+    x, y = x.requires_grad_(True), y.requires_grad_(True)
+    gradients = torch.autograd.grad((weight * answer(x, y)).sum(), (x, y))
+    for which, gradient in enumerate(gradients):
+        direction = torch.randn(gradient.shape, generator=generator, dtype=torch.float64)
+        ends = []
+        for sign in (1e-4, -1e-4):
+            moved = [x.detach(), y.detach()]
+            moved[which] = moved[which] + sign * direction
+            ends.append((weight * answer(*moved, False)).sum())
+        expected = float(ends[0] - ends[1]) / 2e-4
+        assert float((gradient * direction).sum()) == pytest.approx(expected, rel=1e-4)
+
+
 def test_every_ending_has_its_status():
     x, y, q, t = points()
     start = q + 0.3
