@@ -1,10 +1,10 @@
-from . import residuals as residuals
 from .config import CalibrationConfig as CalibrationConfig
 from .config import load_config as load_config
 from .errors import CalibrationFailed as CalibrationFailed
 from .errors import InputError as InputError
 from .errors import RmisCalibError as RmisCalibError
 from .geometry import RigidTransform as RigidTransform
+from .geometry import residuals as residuals
 from .io import Recording as Recording
 from .io import ShaftObservations as ShaftObservations
 from .io import load_recording as load_recording

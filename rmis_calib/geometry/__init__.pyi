@@ -1,3 +1,4 @@
+from . import residuals as residuals
 from .cameras import Camera as Camera
 from .cameras import StereoRig as StereoRig
 from .lines import (
