@@ -12,17 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rmis_calib.geometry.lines import axis_plane, contour_planes, point_line_distance
+
 _SMALLEST = 1e-12
-
-
-def axis_plane(xy: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 3"]:
-    """Unit normal of the plane through the optical centre and an imaged line (paper, section "Shaft detection").
-
-    Args:
-        xy: two points of the line.
-    """
-    rays = torch.cat((xy, torch.ones_like(xy[..., :1])), dim=-1)
-    return torch.nn.functional.normalize(torch.linalg.cross(rays[..., 0, :], rays[..., 1, :]), dim=-1)
 
 
 def axis_rotation(
@@ -31,8 +23,8 @@ def axis_rotation(
     """n.(R v): sine of the angle between the shaft's direction and its plane (paper, Eqs. 6, 9 and 14).
 
     Args:
-        n: unit normal of the plane, in the camera (`axis_plane`). For the left camera turn it into `camera_right` first
-            (Eq. 8), or give `camera_left_R_arm`.
+        n: unit normal of the plane, in the camera (`plane_normal_from_points`). For the left camera turn it into
+            `camera_right` first (Eq. 8), or give `camera_left_R_arm`.
     """
     return (n * _turned(camera_R_arm, arm_v)).sum(-1)
 
@@ -58,17 +50,16 @@ def contour(
 ) -> Float[Tensor, "..."]:
     """Signed distance of an image point from the predicted contour of the shaft, normalised units (DESIGN.md, 4).
 
-    With p, d the RCM and the direction in the camera, M = p x d, m = M/|M|, u = d x m and sin(alpha) = r/|M|, the plane
-    that touches the cylinder has the normal n = cos(alpha) m + side sin(alpha) u, and the residual is n.X / |n_xy|.
+    The contour is the line in which `contour_planes` meets the picture.
 
     Args:
         side: +1 for the contour left of the axis, directed RCM to tip in the picture (edge 0), -1 for the other, 0 for
             the axis itself.
     """
-    m, u, distance = _axis_frame(camera_R_arm, camera_t_arm, arm_p_rcm, arm_v)[:3]
-    sine = side * radius_mm / distance
-    n = (1.0 - sine.square()).sqrt()[..., None] * m + sine[..., None] * u
-    return ((n[..., :2] * xy).sum(-1) + n[..., 2]) / torch.linalg.vector_norm(n[..., :2], dim=-1).clamp_min(_SMALLEST)
+    p, d = _turned(camera_R_arm, arm_p_rcm) + camera_t_arm, _turned(camera_R_arm, arm_v)
+    n = axis_plane(p, d) if side == 0 else contour_planes(p, d, radius_mm)[..., 0 if side > 0 else 1, :]
+    across = torch.linalg.vector_norm(n[..., :2], dim=-1, keepdim=True).clamp_min(_SMALLEST)
+    return point_line_distance(xy, n / across)
 
 
 def end(
@@ -88,7 +79,11 @@ def end(
     Args:
         s_end_mm: coordinate of the end along the axis, from the RCM.
     """
-    m, u, distance, d, s0 = _axis_frame(camera_R_arm, camera_t_arm, arm_p_rcm, arm_v)
+    p, d = _turned(camera_R_arm, arm_p_rcm) + camera_t_arm, _turned(camera_R_arm, arm_v)
+    moment = torch.linalg.cross(p, d)
+    distance = torch.linalg.vector_norm(moment, dim=-1)
+    m = moment / distance[..., None]
+    u = torch.linalg.cross(d, m)
     rays = torch.cat((xy, torch.ones_like(xy[..., :1])), dim=-1)
     X_u, X_d = (u * rays).sum(-1), (d * rays).sum(-1)
     chi = X_d / X_u
@@ -96,7 +91,7 @@ def end(
     across = step[..., 1] * m[..., 0] - step[..., 0] * m[..., 1]
     m_xy = torch.linalg.vector_norm(m[..., :2], dim=-1).clamp_min(_SMALLEST)
     slope = (across / m_xy).abs().clamp_min(_SMALLEST) / X_u.abs()
-    return (chi - (s0 + s_end_mm) / distance) / slope
+    return (chi - ((p * d).sum(-1) + s_end_mm) / distance) / slope
 
 
 def head(
@@ -112,17 +107,3 @@ def head(
 
 def _turned(R: Float[Tensor, "*#batch 3 3"], v: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "... 3"]:
     return (R @ v[..., None])[..., 0]
-
-
-def _axis_frame(
-    R: Float[Tensor, "*#batch 3 3"],
-    t: Float[Tensor, "*#batch 3"],
-    arm_p_rcm: Float[Tensor, "*#batch 3"],
-    arm_v: Float[Tensor, "*#batch 3"],
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """m, u (unit vectors across the axis), distance of the axis from the optical centre, d and s0 = p.d."""
-    p, d = _turned(R, arm_p_rcm) + t, _turned(R, arm_v)
-    M = torch.linalg.cross(p, d)
-    distance = torch.linalg.vector_norm(M, dim=-1)
-    m = M / distance[..., None]
-    return m, torch.linalg.cross(d, m), distance, d, (p * d).sum(-1)

@@ -180,28 +180,20 @@ def _about_offsets(
         probability: that there are offsets at all.
     """
     names = [column.rpartition("_")[0] for column in columns]
-    kinds = zip(names, columns, offsets.sigma.tolist(), offsets.held.tolist(), moves.tolist(), strict=True)
-    visible = [(name, column, sigma, is_held) for name, column, sigma, is_held, moved in kinds if moved]
-    hidden = [name for name, _, _, is_held in visible if is_held]
-    if len(hidden) == len(visible):
-        return f"Constant joint offsets cannot be told from the transform here, and are part of it ({_listed(hidden)})."
-    share = unseen.diagonal().tolist()
-    mixed = [
-        name
-        for name, part, is_held, moved in zip(names, share, offsets.held.tolist(), moves.tolist(), strict=True)
-        if moved and not is_held and part > MIXED_SHARE
-    ]
-    seen = ", ".join(f"{name} {_shown(sigma, column)}" for name, column, sigma, is_held in visible if not is_held)
+    sigmas, held, shares = offsets.sigma.tolist(), offsets.held.tolist(), unseen.diagonal().tolist()
+    joints = zip(names, columns, sigmas, held, shares, moves.tolist(), strict=True)
+    visible = [joint for *joint, moved in joints if moved]
+    hidden = ", ".join(name for name, _, _, is_held, _ in visible if is_held)
+    if all(is_held for _, _, _, is_held, _ in visible):
+        return f"Constant joint offsets cannot be told from the transform here, and are part of it ({hidden})."
+    mixed = [name for name, _, _, is_held, share in visible if not is_held and share > MIXED_SHARE]
+    seen = ", ".join(f"{name} {_shown(sigma, column)}" for name, column, sigma, is_held, _ in visible if not is_held)
     note = f"Constant joint offsets are {100.0 * probability:.0f} % probable; the data see them to 1 sigma of {seen}"
     if hidden:
-        note += f"; those of {_listed(hidden)} cannot be told from the transform and are part of it"
+        note += f"; those of {hidden} cannot be told from the transform and are part of it"
     if len(mixed) > 1:
-        note += f"; a combination of those of {_listed(mixed)} cannot be told from the transform and is part of it"
+        note += f"; a combination of those of {', '.join(mixed)} cannot be told from the transform and is part of it"
     return f"{note}."
-
-
-def _listed(names: list[str]) -> str:
-    return ", ".join(names)
 
 
 def _shown(sigma: float, column: str) -> str:

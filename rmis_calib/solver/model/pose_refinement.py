@@ -5,10 +5,8 @@ many copies of the pose as there are free directions, so a residual needs no der
 Source: Levenberg (1944), Marquardt (1963); Nocedal & Wright, Numerical Optimization, ch. 10.
 """
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Literal
 
 import torch
@@ -19,6 +17,7 @@ from torch import Tensor
 from rmis_calib.errors import InputError, ShapeError
 from rmis_calib.geometry.rotations import quat_multiply, rotvec_to_quat
 from rmis_calib.solver.model.batched_linalg import unit_diagonal
+from rmis_calib.solver.model.forward_mode import load_forward_mode
 from rmis_calib.solver.status import SolveStatus
 
 Residual = Callable[[Float[Tensor, "*batch 4"], Float[Tensor, "*batch 3"]], Float[Tensor, "*batch m"]]
@@ -97,7 +96,7 @@ def refine(
             expected="a quaternion (*batch, 4) and a translation (*batch, 3)",
             found=f"{tuple(quaternion.shape)} and {tuple(translation.shape)}",
         )
-    _load_forward_mode()
+    load_forward_mode()
     with torch.inference_mode(False), torch.no_grad():
         q, t = torch.nn.functional.normalize(quaternion, dim=-1).clone(), translation.clone()
         found = _minimise(residual_fn, q, t, free, max_iterations, tolerance, max_turn_rad)
@@ -120,14 +119,6 @@ def _attached(residual_fn: Residual, found: Refinement, free: Free) -> Refinemen
         newton = -torch.linalg.solve_ex(torch.stack(rows, dim=-2).detach(), gradient[..., None]).result[..., 0]
         q, t = _moved(q, t, newton, free)
     return replace(found, quaternion=q, translation=t)
-
-
-@cache
-def _load_forward_mode() -> None:
-    """Have torch load its forward-mode rules, which warns of what torch itself uses."""
-    with warnings.catch_warnings(), forward_ad.dual_level():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        forward_ad.make_dual(torch.zeros(1), torch.zeros(1))
 
 
 def _minimise(
@@ -202,8 +193,7 @@ def _moved(q: Tensor, t: Tensor, step: Tensor, free: Free) -> tuple[Tensor, Tens
 
 
 def _is_small(step: Tensor, t: Tensor, free: Free, tolerance: float) -> Tensor:
-    length = torch.linalg.vector_norm(t, dim=-1, keepdim=True)
-    limit = tolerance * torch.ones_like(step)
+    size = torch.ones_like(step)
     if free != "rotation":
-        limit = torch.cat((limit[..., :-3], (tolerance * (1.0 + length)).expand(*length.shape[:-1], 3)), dim=-1)
-    return (step.abs() < limit).all(-1)
+        size[..., -3:] += torch.linalg.vector_norm(t, dim=-1, keepdim=True)
+    return (step.abs() < tolerance * size).all(-1)

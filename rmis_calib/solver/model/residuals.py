@@ -40,7 +40,6 @@ So every nuisance and every noise source costs scalar products only. `tests/solv
 of this against `torch.func.jacrev`.
 """
 
-import warnings
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -51,6 +50,7 @@ from torch import Tensor
 from rmis_calib.errors import InputError
 from rmis_calib.geometry.rotations import rotvec_to_matrix
 from rmis_calib.solver.model.batched_linalg import cross, dot, rotate_trials, unit
+from rmis_calib.solver.model.forward_mode import load_forward_mode
 from rmis_calib.solver.model.measurement_rows import MeasurementRows
 
 MAX_SINE = 0.99
@@ -225,13 +225,11 @@ def residual_rows(measured: MeasurementRows, state: State) -> Float[Tensor, "k b
     return _rows(measured, state, predict_shaft(measured, state))
 
 
-def _rows(
-    measured: MeasurementRows, state: State, shaft: Shaft, radius: Tensor | float = 0.0, end: Tensor | float = 0.0
-) -> Tensor:
-    """Residuals of a shaft, its radius and end moved by so much."""
-    parts = [_line_geometry(measured, state, shaft, radius).f.flatten(0, 1)]
+def _rows(measured: MeasurementRows, state: State, shaft: Shaft) -> Float[Tensor, "k b n"]:
+    """Residuals of a shaft wherever it is; its radius, end and edges are those of the state."""
+    parts = [_line_geometry(measured, state, shaft).f.flatten(0, 1)]
     if measured.has_ends:
-        parts.append(_end_geometry(measured, state, shaft, end)[0])
+        parts.append(_end_geometry(measured, state, shaft)[0])
     if measured.has_heads:
         parts.append(_head_geometry(measured, shaft)[0].flatten(0, 1))
     return torch.where(measured.rows_ok, torch.cat(parts), 0.0)
@@ -287,32 +285,24 @@ def _linearise_by_autograd(measured: MeasurementRows, state: State, shaft: Shaft
     Each row depends on its own motion alone, so a step of all shafts at once gives a column of all rows. The eight
     steps (three of a translation, three of a rotation, radius, end) stand side by side as trials.
     """
+    load_forward_mode()
     steps, b = 8, measured.trials
     index = torch.arange(b, device=shaft.D.device).repeat(steps)
-    camera_R = camera_poses(measured, state)[0][index]
-    many, at, p, d, head = measured.take_trials(index), state.take(index), *_of_trials(index, shaft)
-    zero = shaft.D.new_zeros((steps, steps * b, measured.motions))
-    tangent = torch.eye(steps, dtype=zero.dtype, device=zero.device).repeat_interleave(b, dim=1)[..., None]
+    many, at, camera_R = measured.take_trials(index), state.take(index), camera_poses(measured, state)[0][index]
+    p, d, head = (vectors[:, :, index] for vectors in (shaft.p, shaft.d, shaft.head))
+    tangent = torch.eye(steps, dtype=p.dtype, device=p.device).repeat_interleave(b, dim=1)
 
-    def rows(step: Float[Tensor, "8 b n"]) -> Float[Tensor, "k b n"]:
-        tau, phi = rotate_trials(camera_R, step[:3]), rotate_trials(camera_R, step[3:6])
+    def rows(step: Float[Tensor, "8 b"]) -> Float[Tensor, "k b n"]:
+        tau, phi = rotate_trials(camera_R, step[:3, :, None]), rotate_trials(camera_R, step[3:6, :, None])
         moved = _shaft(p + tau, d + cross(phi, d), head + cross(phi, head))
-        return _rows(many, at, moved, step[6], step[7])
+        return _rows(many, replace(at, radius=at.radius + step[6], end_offset=at.end_offset + step[7]), moved)
 
-    with warnings.catch_warnings():  # torch warns of what it does itself when its rules load
-        warnings.simplefilter("ignore", DeprecationWarning)
-        with torch.inference_mode(False), torch.no_grad(), forward_ad.dual_level():
-            dual = forward_ad.make_dual(zero.clone(), tangent.expand_as(zero).clone())
-            effect = forward_ad.unpack_dual(rows(dual)).tangent
-            if effect is None:
-                raise InputError(where="residuals", expected="rows that depend on the shaft", found="none")
-            effect = torch.where(many.rows_ok, effect, 0.0).unflatten(1, (steps, b)).transpose(0, 1)
+    with torch.inference_mode(False), torch.no_grad(), forward_ad.dual_level():
+        effect = forward_ad.unpack_dual(rows(forward_ad.make_dual(torch.zeros_like(tangent), tangent))).tangent
+        if effect is None:
+            raise InputError(where="residuals", expected="rows that depend on the shaft", found="none")
+        effect = torch.where(many.rows_ok, effect, 0.0).unflatten(1, (steps, b)).transpose(0, 1)
     return LinearisedRows(_rows(measured, state, shaft), effect[:3], effect[3:6], effect[6], effect[7])
-
-
-def _of_trials(index: Tensor, shaft: Shaft) -> tuple[Tensor, Tensor, Tensor]:
-    """p, d and head of these trials."""
-    return shaft.p[:, :, index], shaft.d[:, :, index], shaft.head[:, :, index]
 
 
 def _into_right(camera_R: Float[Tensor, "b c 3 3"], v: Float[Tensor, "3 m c b n"]) -> Float[Tensor, "3 m c b n"]:
@@ -342,7 +332,7 @@ class LineGeometry:
 
 def _line_geometry(measured: MeasurementRows, state: State, shaft: Shaft, radius: Tensor | float = 0.0) -> LineGeometry:
     x, y = measured.line_xy.unbind()
-    sine = (measured.line_rho * ((state.radius[:, None] + radius) / shaft.D)).clamp(-MAX_SINE, MAX_SINE)
+    sine = (measured.line_rho * (state.radius[:, None] / shaft.D)).clamp(-MAX_SINE, MAX_SINE)
     cosine = (1.0 - sine.square()).sqrt()
     n_image = torch.addcmul(cosine * shaft.m[:2, None], sine, shaft.u[:2, None])
     n_xy = _held(n_image.square().sum(0).sqrt().clamp_min(1e-12))
@@ -365,9 +355,7 @@ def _held(value: Tensor) -> Tensor:
     return value.detach()
 
 
-def _end_geometry(
-    measured: MeasurementRows, state: State, shaft: Shaft, end: Tensor | float = 0.0
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _end_geometry(measured: MeasurementRows, state: State, shaft: Shaft) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """e, chi, s_e and d e / d s_e without its sign, all (c, b, n)."""
     x, y = measured.end_xy.unbind()
     u, d, m = shaft.u, shaft.d, shaft.m
@@ -379,7 +367,7 @@ def _end_geometry(
     step = d[:2] - chi * u[:2]
     across = torch.addcmul(step[1] * image_m[0], step[0], image_m[1], value=-1.0)
     slope = _held((across / m_xy).abs().clamp_min(1e-12) / X_u.abs())
-    s_end = (measured.s_end + state.end_offset[:, None] + end).expand_as(chi)
+    s_end = (measured.s_end + state.end_offset[:, None]).expand_as(chi)
     gain = (shaft.D * slope).reciprocal()
     if measured.autograd:  # the same value; its derivative is that of the predicted end, seen from a held direction
         return -dot(_held(d - chi * u), shaft.p + s_end * d) * _held(gain), chi, s_end, gain

@@ -23,7 +23,7 @@ MAX_TURN_RAD = 0.1
 Gauss-Newton steps leap from the wrong basin, into which the linear start falls at c = 0.5 already (164 degrees off), to
 the right one in about nine of ten trials; that is luck, and `global` does it by search."""
 QUATERNION_TOLERANCE = 1e-7
-"""rad; the last step taken is the square of that."""
+"""rad. Steps shrink quadratically near the minimum, so what is left after such a step is far smaller still."""
 
 
 def linear_rotation(gram: Float[Tensor, "b 9 9"]) -> Float[Tensor, "b 3 3"]:
