@@ -137,7 +137,7 @@ class SolverSettings:
     """Further motions that are proposed."""
     derivatives: Literal["analytic", "autograd"] = "analytic"
     """Where `joint` takes the derivatives of the residuals from. Both give the same answer; the analytic ones are
-    eight times faster (1,728 motions), autograd needs no formula."""
+    six to eight times faster (1,728 motions), autograd needs no formula."""
     robust: Literal["auto", "on", "off"] = "auto"
     """Outlier rejection by graduated non-convexity: `auto` where the first fit shows measurements that noise does not
     explain."""
