@@ -1,7 +1,8 @@
 """Observations to the answer: the solver's tensors turned into a result with frames, units and a status."""
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal, overload
 
 import numpy as np
 import torch
@@ -9,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rmis_calib.config import CalibrationConfig
-from rmis_calib.errors import CalibrationFailed
+from rmis_calib.errors import CalibrationFailed, InputError
 from rmis_calib.geometry.rigid import RigidTransform
 from rmis_calib.io import ShaftObservations
 from rmis_calib.pipeline.device import require_device
@@ -41,15 +42,42 @@ TOO_FAR_SIGMA = 4.0
 """An unknown estimated this many prior sigmas from its nominal value says that the model does not fit the data."""
 
 
+@overload
 def solve(
-    observations: ShaftObservations, config: CalibrationConfig | None = None, *, throw: bool = True
-) -> CalibrationResult:
+    observations: ShaftObservations,
+    config: CalibrationConfig | None = None,
+    *,
+    throw: bool = True,
+    differentiable: Literal[False] = False,
+) -> CalibrationResult: ...
+
+
+@overload
+def solve(
+    observations: ShaftObservations | Mapping[str, Any],
+    config: CalibrationConfig | None = None,
+    *,
+    differentiable: Literal[True],
+) -> Solution: ...
+
+
+def solve(
+    observations: ShaftObservations | Mapping[str, Any],
+    config: CalibrationConfig | None = None,
+    *,
+    throw: bool = True,
+    differentiable: bool = False,
+) -> CalibrationResult | Solution:
     """Estimate `camera_right_T_arm` from observations.
 
     Args:
-        observations: N motions in the keys of DESIGN.md 6.2.
+        observations: N motions in the keys of DESIGN.md 6.2; with `differentiable` also a mapping of these keys to
+            tensors, with any leading batch of trials.
         config: method, measurements to use, noise, thresholds; the defaults when None.
         throw: raise when the result is not trustworthy; otherwise its `status` and `message` say so.
+        differentiable: return the solver's tensors, of which `camera_right_T_arm` and `covariance` pass gradients to
+            the tensors of the observations (`solver.solve` says what they include). Joint and clock offsets are then
+            not estimated, and nothing is raised for trials without a trustworthy answer: `status` and `verdict` say so.
     Raises:
         CalibrationFailed: no trustworthy result (with `throw`); its `result` holds what there is.
         InsufficientDataError: too few motions.
@@ -57,6 +85,16 @@ def solve(
     """
     config = config or CalibrationConfig()
     require_device(config.device)
+    if differentiable:
+        keys = observations if isinstance(observations, Mapping) else vars(observations)
+        problem = Problem.from_arrays(keys, device=config.device).only(*config.measurements)
+        return solve_problem(problem, config.solver, differentiable=True)
+    if not isinstance(observations, ShaftObservations):
+        raise InputError(
+            where="observations",
+            expected="ShaftObservations (a mapping with `differentiable`)",
+            found=type(observations),
+        )
     unknowns = file_unknowns(observations, config.solver, config.device)
     if unknowns is None:
         solution, notes = estimate(observations, config), ()

@@ -3,11 +3,18 @@
 from dataclasses import replace
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from rmis_calib.errors import InputError, InsufficientDataError, ObservationsError
-from rmis_calib.solver.assess.assemble import CHECKED_MOTIONS, SHOWN_MOTIONS, joint_solution, two_step_solution
+from rmis_calib.geometry.rigid import rigid_from_rotation_translation
+from rmis_calib.solver.assess.assemble import (
+    CHECKED_MOTIONS,
+    SHOWN_MOTIONS,
+    joint_on_graph,
+    joint_solution,
+    two_step_solution,
+)
 from rmis_calib.solver.assess.information import motion_information, select_d_optimal
 from rmis_calib.solver.estimate.map_estimate import map_estimate
 from rmis_calib.solver.estimate.relinearise import Kinematics, solve_relinearised
@@ -15,7 +22,7 @@ from rmis_calib.solver.model.measurement_rows import pack
 from rmis_calib.solver.problem import MIN_MOTIONS, Problem
 from rmis_calib.solver.settings import SolverSettings
 from rmis_calib.solver.solution import AlternativeModel, Solution, concatenate, map_tensors
-from rmis_calib.solver.start.candidates import find_candidates
+from rmis_calib.solver.start.candidates import best_candidate
 from rmis_calib.solver.start.line_statistics import LineStatistics
 from rmis_calib.solver.start.paper import average, empirical_covariance, influence, solve_paper, votes
 from rmis_calib.solver.status import MotionReason
@@ -31,6 +38,7 @@ def solve(
     method: str | None = None,
     kinematics: Kinematics | None = None,
     alternative: AlternativeModel | None = None,
+    differentiable: bool = False,
 ) -> Solution:
     """Estimates `camera_right_T_arm` of every trial.
 
@@ -40,13 +48,23 @@ def solve(
         method: overrides the settings' method.
         kinematics: evaluates both arms at joint and clock offsets (relinearise.py); with it, `joint` iterates on them.
         alternative: the answer of another model, which the covariance of `joint` then allows for.
+        differentiable: whether `camera_right_T_arm`, `camera_left_T_camera_right` and `covariance` pass gradients to
+            the problem's tensors. They are those of the whole solve, by implicit differentiation at the answer
+            (estimate/on_graph.py), noise levels and bias correction included; held are the choices that jump: which
+            measurements are outliers, which basin was taken, which motions are kept. All motions are on the graph at
+            once: about 100 kB each in `joint`. Gradients of trials that did not converge mean nothing.
 
     Raises:
+        InputError: `differentiable` together with `kinematics` or `alternative`.
         ObservationsError: values that are not finite where they must be, or rotations that are not rotations.
         InsufficientDataError: too few measured lines in some trial.
     """
     settings = settings or SolverSettings()
-    with torch.inference_mode():  # no graph is kept: a fifth of the time of 1,728 motions
+    if differentiable and (kinematics is not None or alternative is not None):
+        raise InputError(
+            where="differentiable", expected="a solve without kinematics of offsets", found="one with them"
+        )
+    with torch.inference_mode(not differentiable):  # no graph is kept: a fifth of the time of 1,728 motions
         solution = _solve_groups(problem.flatten_batch(), settings, method or settings.method, kinematics, alternative)
     return _shaped(solution, problem.batch_shape)
 
@@ -78,23 +96,39 @@ def _solve_flat(
     kinematics: Kinematics | None = None,
     alternative: AlternativeModel | None = None,
 ) -> Solution:
-    """Trials that are solved together, checked before."""
+    """Trials that are solved together, checked before. Outside of inference mode, on the graph of the problem."""
     if method != "joint":
         return _solve_two_step(flat, settings, method)
-    chosen, index, kept = flat, None, 1.0
-    if settings.thin_to is not None and settings.thin_to < flat.n_motions:
-        index, kept = _informative(flat, settings, settings.thin_to)
-        chosen = flat.select_motions(index)
-    if kinematics is None:
-        fit = map_estimate(chosen, settings)
-    else:
-        fit = solve_relinearised(chosen, settings, _of_motions(kinematics, index))
-    solution = joint_solution(fit, settings, alternative)
+    chosen, index, kept, on_graph = flat, None, 1.0, not torch.is_inference_mode_enabled()
+    with torch.no_grad():
+        if settings.thin_to is not None and settings.thin_to < flat.n_motions:
+            index, kept = _informative(flat, settings, settings.thin_to)
+            chosen = flat.select_motions(index)
+        if kinematics is None:
+            fit = map_estimate(chosen.detach(), settings)
+        else:
+            fit = solve_relinearised(chosen, settings, _of_motions(kinematics, index))
+        solution = joint_solution(fit, settings, alternative)
+    if on_graph:
+        solution = joint_on_graph(solution, flat if index is None else flat.select_motions(index), fit, settings)
     return solution if index is None else replace(_spread(solution, index, flat.n_motions), information_kept=kept)
 
 
 def _solve_two_step(flat: Problem, settings: SolverSettings, method: str) -> Solution:
-    """`paper` and `global`: rotation, then translation, from sums over the axis lines."""
+    """`paper` and `global`."""
+    R, t, covariance = _two_step_estimate(flat, settings, method)
+    with torch.no_grad():
+        solution = two_step_solution(flat.detach(), R.detach(), t.detach(), covariance.detach(), settings, method)
+    if torch.is_inference_mode_enabled():
+        return solution
+    unseen = solution.covariance - covariance.detach()  # what the lines do not tell
+    return replace(solution, camera_right_T_arm=rigid_from_rotation_translation(R, t), covariance=covariance + unseen)
+
+
+def _two_step_estimate(
+    flat: Problem, settings: SolverSettings, method: str
+) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], Float[Tensor, "b 6 6"]]:
+    """Rotation, then translation, from sums over the axis lines; and the scatter of both."""
     statistics = LineStatistics.from_problem(flat)
     fewest = int(statistics.count.sum(-1).min())
     if fewest < MIN_MOTIONS:
@@ -107,10 +141,9 @@ def _solve_two_step(flat: Problem, settings: SolverSettings, method: str) -> Sol
         R, t = average(R_each, t_each, weight)
         shares = influence(part, R_each, t_each, weight)
     else:
-        R, t, _ = find_candidates(statistics, settings.grid, settings.minima).best()
+        R, t = best_candidate(statistics, settings.grid, settings.minima)
         shares = influence(part, R[:, None], t[:, None])
-    covariance = empirical_covariance(shares) * (part.n_motions / flat.n_motions)
-    return two_step_solution(flat, R, t, covariance, settings, method)
+    return R, t, empirical_covariance(shares) * (part.n_motions / flat.n_motions)
 
 
 def _of_motions(kinematics: Kinematics, index: Int[Tensor, " k"] | None) -> Kinematics:
@@ -162,7 +195,7 @@ def _check(problem: Problem) -> None:
         ("arm_T_rcm", poses[..., :3, :3]),
         ("camera_left_T_camera_right", problem.camera_T_camera_right[..., :3, :3]),
     ):
-        gap = float((R @ R.mT - torch.eye(3, dtype=R.dtype, device=R.device)).abs().max())
+        gap = float((R.detach() @ R.detach().mT - torch.eye(3, dtype=R.dtype, device=R.device)).abs().max())
         handed = (torch.linalg.cross(R[..., 0], R[..., 1]) * R[..., 2]).sum(-1)  # LU of a million 3x3 takes a second
         if not gap < 1e-5 or not bool((handed > 0).all()):
             raise ObservationsError(

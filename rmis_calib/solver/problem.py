@@ -144,6 +144,10 @@ class Problem:
 
         return _map_tensors(self, lambda x, _: flat(x))
 
+    def detach(self) -> "Problem":
+        """The same off any graph."""
+        return _map_tensors(self, lambda x, _: x.detach())
+
     def take_trials(self, index: Tensor | slice | int) -> "Problem":
         """The problem of some trials of the only batch axis, in this order; with a number, that trial without the
         axis."""

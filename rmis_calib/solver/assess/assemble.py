@@ -12,6 +12,7 @@ from rmis_calib.solver.assess.observability import assess, detect_degeneracies
 from rmis_calib.solver.estimate.map_estimate import MapEstimate
 from rmis_calib.solver.estimate.multistart import cheirality
 from rmis_calib.solver.estimate.noise_levels import COMPONENTS, assumed_noise
+from rmis_calib.solver.estimate.on_graph import attach
 from rmis_calib.solver.estimate.outliers import REJECTED
 from rmis_calib.solver.model.measurement_rows import END, HEAD, LINE, MeasurementRows, pack
 from rmis_calib.solver.model.normal_equations import NoiseModel, motion_distance2
@@ -129,6 +130,26 @@ def joint_solution(fit: MapEstimate, settings: SolverSettings, alternative: Alte
         residual_lines=shown.lines,
         residual_ends=shown.ends,
         residual_heads=shown.heads,
+    )
+
+
+def joint_on_graph(solution: Solution, problem: Problem, fit: MapEstimate, settings: SolverSettings) -> Solution:
+    """The solution with its transforms and covariance as functions of the problem's tensors.
+
+    Args:
+        problem: what `fit` is the estimate of, on the graph.
+    """
+    found = attach(problem, fit, settings)
+    rows = fit.model.measured.keep(fit.weight > REJECTED).rows_ok.sum((0, 2))
+    excess = found.chi2 / (rows - 6.0).clamp_min(1.0)
+    left = solution.camera_left_T_camera_right
+    return replace(
+        solution,
+        camera_right_T_arm=rigid_from_rotation_translation(found.state.R, found.state.t),
+        camera_left_T_camera_right=None
+        if left is None
+        else rigid_from_rotation_translation(found.state.stereo_R, found.state.stereo_t),
+        covariance=found.covariance[:, :6, :6] * excess.clamp_min(1.0)[:, None, None],
     )
 
 

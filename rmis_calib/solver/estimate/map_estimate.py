@@ -16,7 +16,7 @@ from rmis_calib.solver.estimate.one_step_update import one_step_update
 from rmis_calib.solver.estimate.outliers import REJECTED, anneal, classify
 from rmis_calib.solver.model.batched_linalg import rescaled, unit_diagonal
 from rmis_calib.solver.model.measurement_rows import MeasurementRows, pack
-from rmis_calib.solver.model.normal_equations import NoiseModel, WeightedModel, with_prior
+from rmis_calib.solver.model.normal_equations import NoiseModel, Normal, WeightedModel, with_prior
 from rmis_calib.solver.model.parameters import NuisancePriors, initial_state, make_layout
 from rmis_calib.solver.model.residuals import State
 from rmis_calib.solver.problem import Problem
@@ -89,8 +89,7 @@ def map_estimate(problem: Problem, settings: SolverSettings, start: "MapEstimate
     """
     measured = replace(pack(problem, settings.noise), autograd=settings.derivatives == "autograd")
     assumed, free = assumed_noise(problem, settings.noise)
-    generator = torch.Generator().manual_seed(settings.seed)
-    order = torch.randperm(measured.motions, generator=generator).to(measured.p.device)
+    order = motion_order(measured, settings.seed)
     if measured.trials == 1 and measured.motions > LONG and start is None:
         first = map_estimate(problem.select_motions(order[:LONG_SAMPLE]), replace(settings, bias_correction=False))
         model = replace(first.model, measured=measured, weight=None)
@@ -111,6 +110,12 @@ def map_estimate(problem: Problem, settings: SolverSettings, start: "MapEstimate
     model = replace(model, noise=noise)
     refined, weight = _refine_all(model, state, contaminated or settings.robust == "on", settings)
     return _finish(problem, replace(model, weight=weight), refined, settings)
+
+
+def motion_order(measured: MeasurementRows, seed: int) -> Int[Tensor, " n"]:
+    """Order in which motions are drawn into samples."""
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randperm(measured.motions, generator=generator).to(measured.p.device)
 
 
 def _settle_noise(
@@ -158,11 +163,7 @@ def _finish(problem: Problem, model: WeightedModel, refined: Refined, settings: 
     bias = torch.zeros_like(normal.g)
     information = normal.H
     if settings.bias_correction:
-        expected = expected_score(model, state, settings.bias_motions, settings.seed)
-        prior = with_prior(replace(normal, H=torch.zeros_like(normal.H)), model.layout, state).H
-        delta = _seen_step(normal.H, prior, normal.g - expected.g)
-        state, bias = state.moved(model.layout.step(delta)), -delta
-        information = floored_information(normal.H - prior, expected.H, prior) + prior
+        state, information, bias = debias(model, state, normal, settings)
     scaled, scale = unit_diagonal(information)
     scaled = torch.nan_to_num(scaled, posinf=0.0, neginf=0.0)
     sample = slice(None, None, max(1, model.measured.motions // LONG_SAMPLE))
@@ -184,6 +185,21 @@ def _finish(problem: Problem, model: WeightedModel, refined: Refined, settings: 
     )
 
 
+def debias(
+    model: WeightedModel, state: State, normal: Normal, settings: SolverSettings
+) -> tuple[State, Float[Tensor, "b p p"], Float[Tensor, "b p"]]:
+    """State without its bias, information without that of noise in the Jacobian (bias.py), and the bias.
+
+    Args:
+        normal: the normal equations of the state, with priors.
+    """
+    expected = expected_score(model, state, settings.bias_motions, settings.seed)
+    prior = with_prior(replace(normal, H=torch.zeros_like(normal.H)), model.layout, state).H
+    delta = _seen_step(normal.H, prior, normal.g - expected.g)
+    information = floored_information(normal.H - prior, expected.H, prior) + prior
+    return state.moved(model.layout.step(delta)), information, -delta
+
+
 def _weights(model: WeightedModel) -> Float[Tensor, "c b n"]:
     everything = torch.ones_like(model.measured.line_ok[0], dtype=model.measured.p.dtype)
     return everything if model.weight is None else model.weight
@@ -193,12 +209,18 @@ def _seen_step(
     H: Float[Tensor, "b p p"], prior: Float[Tensor, "b p p"], g: Float[Tensor, "b p"]
 ) -> Float[Tensor, "b p"]:
     """-H^-1 g without the directions in which the data add nothing to the prior: there a simulated score is
-    rounding."""
-    scaled, scale = unit_diagonal(H)
-    values, vectors = torch.linalg.eigh(torch.nan_to_num(scaled))
-    from_prior = ((vectors.mT @ rescaled(prior, scale)) * vectors.mT).sum(-1)
+    rounding. Which these are is held where autograd looks on."""
+    with torch.no_grad():
+        scaled, scale = unit_diagonal(H)
+        values, vectors = torch.linalg.eigh(torch.nan_to_num(scaled))
+        from_prior = ((vectors.mT @ rescaled(prior, scale)) * vectors.mT).sum(-1)
+        seen = from_prior < MOSTLY_PRIOR * values
+    if H.requires_grad:
+        solved = torch.linalg.solve_ex(rescaled(H, scale), (g * scale)[..., None]).result
+        along = vectors.mT @ solved
+        return -scale * (vectors @ torch.where(seen[..., None], along, 0.0))[..., 0]
     along = (vectors.mT @ (torch.nan_to_num(g) * scale)[..., None])[..., 0]
-    along = torch.where(from_prior < MOSTLY_PRIOR * values, along / values, 0.0)
+    along = torch.where(seen, along / values, 0.0)
     return -scale * (vectors @ along[..., None])[..., 0]
 
 
@@ -214,6 +236,8 @@ def floored_information(
         expected: E[H] of the data.
         prior: sets the scale of an unknown of which the data know nothing, where H is rounding.
     """
+    free = 2.0 * H - expected if H.requires_grad else None  # its derivative is that of what no floor touches
+    H, expected, prior = H.detach(), expected.detach(), prior.detach()
     _, scale = unit_diagonal(H + prior)
     values, vectors = torch.linalg.eigh(torch.nan_to_num(rescaled(H, scale)))
     root = vectors * values.clamp_min(1e-14).rsqrt()[:, None] @ vectors.mT
@@ -222,7 +246,8 @@ def floored_information(
     kept = (1.0 - part).clamp(INFORMATION_FLOOR, 1.0 / INFORMATION_FLOOR)
     half = vectors * values.clamp_min(0.0).sqrt()[:, None] @ vectors.mT
     corrected = half @ (turn * kept[:, None] @ turn.mT) @ half
-    return rescaled(corrected, scale.reciprocal())
+    corrected = rescaled(corrected, scale.reciprocal())
+    return corrected if free is None else corrected + (free - free.detach())
 
 
 def _check_rows(measured: MeasurementRows) -> None:

@@ -16,7 +16,7 @@ import math
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rmis_calib.solver.model.batched_linalg import rescaled, unit_diagonal
@@ -81,9 +81,8 @@ def estimate_components(
     J = columns(layout, linear, shaft, measured, state).permute(2, 3, 0, 1)  # (b, n, k, p)
     r = linear.r.permute(1, 2, 0)[..., None]
     parts = _component_matrices(measured, linear)
-    centre = torch.stack([getattr(assumed, name) for name in COMPONENTS], dim=-1).clamp_min(1e-30).log()
-    free_mask = torch.stack([free[name] for name in COMPONENTS], dim=-1) & _present(measured)
-    prior = (2.0 * math.log(settings.prior_factor)) ** -2
+    free_mask = free_components(measured, free)
+    centre, prior = log_prior(assumed, settings)
     for _ in range(SCORING_STEPS):
         theta = torch.stack([getattr(noise, name) for name in COMPONENTS], dim=-1).clamp_min(1e-30).log()
         score, fisher = _score(measured, linear, J, r, noise, parts, layout)
@@ -102,6 +101,17 @@ def estimate_components(
         if not bool((torch.where(fixed, 0.0, step).abs() > SETTLED).any()):
             break
     return noise
+
+
+def free_components(measured: MeasurementRows, free: dict[str, Tensor]) -> Bool[Tensor, "b m"]:
+    """Which components are estimated: those left open that act on any measured row."""
+    return torch.stack([free[name] for name in COMPONENTS], dim=-1) & _present(measured)
+
+
+def log_prior(assumed: NoiseModel, settings: NoiseSettings) -> tuple[Float[Tensor, "b m"], float]:
+    """Centre of the prior of each component's logarithm, and its weight 1/sigma^2."""
+    centre = torch.stack([getattr(assumed, name) for name in COMPONENTS], dim=-1).clamp_min(1e-30).log()
+    return centre, (2.0 * math.log(settings.prior_factor)) ** -2
 
 
 def _present(measured: MeasurementRows) -> Tensor:

@@ -29,7 +29,7 @@ def cross(a: Float[Tensor, "3 ..."], b: Float[Tensor, "3 ..."]) -> Float[Tensor,
 
 def add_cross_(out: Float[Tensor, "3 ..."], a: Float[Tensor, "3 ..."], b: Float[Tensor, "3 ..."]) -> None:
     """Adds a x b to `out`, in place; a and b broadcast."""
-    x, y, z = out.unbind()
+    x, y, z = out[0], out[1], out[2]  # not unbind: autograd refuses to change its outputs in place
     (a0, a1, a2), (b0, b1, b2) = a.unbind(), b.unbind()
     x.addcmul_(a1, b2).addcmul_(a2, b1, value=-1.0)
     y.addcmul_(a2, b0).addcmul_(a0, b2, value=-1.0)

@@ -41,6 +41,8 @@ class MeasurementRows:
         joint: displacement of the shaft per unit of joint offset, in `arm`; None where unknown.
         clock: displacement per second, in `arm`.
         autograd: whether `residuals.linearise` takes the derivatives from autograd.
+        exact: whether autograd also differentiates what the analytic derivatives hold (residuals.py): for the
+            derivative of the estimate, not of a residual.
     """
 
     p: Float[Tensor, "3 b n"]
@@ -63,6 +65,7 @@ class MeasurementRows:
     joint: Float[Tensor, "6 j b n"] | None = None
     clock: Float[Tensor, "6 b n"] | None = None
     autograd: bool = False
+    exact: bool = False
 
     @property
     def trials(self) -> int:

@@ -105,6 +105,7 @@ class Normal:
         chi2: r^T S^-1 r.
         rows: number of measured rows.
         distance2: r^T S^-1 r of each motion.
+        logdet: log det S, summed over motions; only where autograd looks on.
         factor: the eliminated systems, for `frozen_chi2`, when asked for.
         linear: the rows that these are of, likewise.
     """
@@ -114,8 +115,16 @@ class Normal:
     chi2: Float[Tensor, " b"]
     rows: Float[Tensor, " b"]
     distance2: Float[Tensor, "b n"]
+    logdet: Float[Tensor, " b"] | None = None
     factor: Tensor | None = None
     linear: LinearisedRows | None = None
+
+    @property
+    def kept_logdet(self) -> Tensor:
+        """The determinant of normal equations that autograd looks on."""
+        if self.logdet is None:
+            raise InputError(where="Normal.logdet", expected="tensors that require a gradient", found="none")
+        return self.logdet
 
     @property
     def kept_factor(self) -> Tensor:
@@ -188,14 +197,20 @@ def normal_equations(model: WeightedModel, state: State, keep: bool = False) -> 
     linear, shaft = linearise(measured, state)
     k, b, n = linear.r.shape
     p = layout.size
-    augmented = torch.empty((k, k + p + 1, b, n), dtype=linear.r.dtype, device=linear.r.device)
     image = image_variance(measured, model.noise)
-    covariance(linear.w, linear.a, image, measured.cameras, model.noise, augmented[:, :k], model.weight)
-    columns(layout, linear, shaft, measured, state, out=augmented[:, k:-1])
-    augmented[:, -1] = linear.r
-    eliminate(augmented)
-    pivots = augmented.diagonal(dim1=0, dim2=1).permute(2, 0, 1)  # (k, b, n)
-    white = augmented[:, k:].mul_(pivots.rsqrt()[:, None])
+    factor = logdet = None
+    if linear.r.requires_grad:
+        J = columns(layout, linear, shaft, measured, state)
+        white, logdet = _whitened(model, linear, image, torch.cat((J, linear.r[:, None]), dim=1))
+    else:
+        augmented = torch.empty((k, k + p + 1, b, n), dtype=linear.r.dtype, device=linear.r.device)
+        covariance(linear.w, linear.a, image, measured.cameras, model.noise, augmented[:, :k], model.weight)
+        columns(layout, linear, shaft, measured, state, out=augmented[:, k:-1])
+        augmented[:, -1] = linear.r
+        eliminate(augmented)
+        factor = augmented[:, :k]
+        pivots = factor.diagonal(dim1=0, dim2=1).permute(2, 0, 1)  # (k, b, n)
+        white = augmented[:, k:].mul_(pivots.rsqrt()[:, None])
     gram = torch.matmul(white.permute(0, 2, 1, 3), white.permute(0, 2, 3, 1)).sum(0)  # (b, p + 1, p + 1)
     return Normal(
         H=gram[:, :p, :p],
@@ -203,9 +218,36 @@ def normal_equations(model: WeightedModel, state: State, keep: bool = False) -> 
         chi2=gram[:, p, p],
         rows=measured.rows_ok.sum((0, 2)).to(gram.dtype),
         distance2=white[:, -1].square().sum(0),
-        factor=augmented[:, :k] if keep else None,
+        logdet=logdet,
+        factor=factor if keep else None,
         linear=linear if keep else None,
     )
+
+
+def _whitened(
+    model: WeightedModel, linear: LinearisedRows, image: Float[Tensor, "k b n"], columns: Float[Tensor, "k q b n"]
+) -> tuple[Float[Tensor, "k q b n"], Float[Tensor, " b"]]:
+    """L^-1 columns, with S = L L^T as `covariance` writes it, and log det S summed over motions; for autograd, which
+    does not follow what is done in place."""
+    noise, c = model.noise, model.measured.cameras
+    w, a = (x.permute(2, 3, 1, 0).contiguous() for x in (linear.w, linear.a))  # (b, n, k, 3)
+    shift, turn = w @ w.mT, a @ a.mT
+    camera = torch.arange(w.shape[-2], device=w.device) % c
+    same = (camera[:, None] == camera).to(w.dtype)
+
+    def at(variance: Tensor) -> Tensor:
+        return variance[:, None, None, None]
+
+    S = (at(noise.kinematics_mm) + at(noise.camera_mm) * same) * shift
+    S = S + (at(noise.kinematics_rad) + at(noise.camera_rad) * same) * turn
+    S = S + torch.diag_embed(image.permute(1, 2, 0))
+    if model.weight is not None:
+        weight = model.weight.permute(1, 2, 0)[..., camera]  # (b, n, k)
+        S = torch.where(same > 0, S / weight[..., None], S)
+    factor, _ = torch.linalg.cholesky_ex(S)
+    white = torch.linalg.solve_triangular(factor, columns.permute(2, 3, 0, 1).contiguous(), upper=False)
+    white = white.permute(2, 3, 0, 1).contiguous()
+    return white, 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum((1, 2))
 
 
 def frozen_chi2(factor: Float[Tensor, "k k b n"], r: Float[Tensor, "k b n"]) -> Float[Tensor, "b n"]:
@@ -236,8 +278,8 @@ def accumulate(model: WeightedModel, state: State) -> Normal:
         per_trial.append(_joined([normal_equations(model.narrow(trials, motions), at) for motions in along]))
     if len(per_trial) == 1:
         return with_prior(per_trial[0], model.layout, state)
-    names = ("H", "g", "chi2", "rows", "distance2")
-    joined = {name: torch.cat([getattr(part, name) for part in per_trial]) for name in names}
+    joined = {name: torch.cat([getattr(part, name) for part in per_trial]) for name in _sums_of(per_trial)}
+    joined["distance2"] = torch.cat([part.distance2 for part in per_trial])
     return with_prior(replace(per_trial[0], **joined), model.layout, state)
 
 
@@ -245,8 +287,14 @@ def _joined(parts: list[Normal]) -> Normal:
     """Parts of the motions of the same trials."""
     if len(parts) == 1:
         return parts[0]
-    sums = {name: torch.stack([getattr(part, name) for part in parts]).sum(0) for name in ("H", "g", "chi2", "rows")}
+    sums = {name: torch.stack([getattr(part, name) for part in parts]).sum(0) for name in _sums_of(parts)}
     return replace(parts[0], **sums, distance2=torch.cat([part.distance2 for part in parts], dim=-1))
+
+
+def _sums_of(parts: list[Normal]) -> list[str]:
+    """What is a sum over motions in these parts."""
+    names = ["H", "g", "chi2", "rows", "logdet"]
+    return [name for name in names if getattr(parts[0], name) is not None]
 
 
 def motion_distance2(measured: MeasurementRows, state: State, noise: NoiseModel) -> Float[Tensor, "b n"]:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rmis_calib.errors import InputError
-from rmis_calib.solver.model.batched_linalg import add_cross_, batch_last, dot, rotate
+from rmis_calib.solver.model.batched_linalg import add_cross_, batch_last, cross, dot, rotate
 from rmis_calib.solver.model.measurement_rows import LINE, MeasurementRows, line_points
 from rmis_calib.solver.model.residuals import LinearisedRows, Shaft, State, rcm_axes
 from rmis_calib.solver.problem import Problem
@@ -190,8 +190,11 @@ def columns(
     """Jacobian of the residuals, in the order of the layout's blocks (residuals.py derives it).
 
     Args:
-        out: where to write it.
+        out: where to write it; not where autograd looks on.
     """
+    if linear.r.requires_grad:
+        blocks = [_columns_of(name, linear, shaft, measured, state) for name in layout.blocks]
+        return torch.cat(blocks).transpose(0, 1)
     if out is None:
         out = linear.r.new_empty((linear.r.shape[0], layout.size, *linear.r.shape[1:]))
     by_parameter = out.transpose(0, 1)  # (p, k, b, n)
@@ -209,16 +212,31 @@ def columns(
                 turned(target, right_p, linear.w[:, 1::2], linear.a[:, 1::2])
             else:
                 target.copy_(linear.w[:, 1::2])
-    if "radius" in layout.blocks:
-        by_parameter[layout.blocks["radius"]] = linear.radius
-    if "end_offset" in layout.blocks:
-        by_parameter[layout.blocks["end_offset"]] = linear.end
-    for name in ("rcm_offset", "joint_offset", "clock"):
-        if name in layout.blocks:
-            by_parameter[layout.blocks[name]] = _displaced(name, linear, measured, state)
-    if "edge_bias" in layout.blocks:
-        out[:, layout.blocks["edge_bias"]] = _shifts(measured, linear.r)
+    for name, part in layout.blocks.items():
+        if name not in ("rotation", "translation", "stereo_rotation", "stereo_translation"):
+            by_parameter[part] = _columns_of(name, linear, shaft, measured, state)
     return out
+
+
+def _columns_of(
+    name: str, linear: LinearisedRows, shaft: Shaft, measured: MeasurementRows, state: State
+) -> Float[Tensor, "q k b n"]:
+    """Columns of one block, without writing in place."""
+    right_p = shaft.p[:, :1]
+    if name == "rotation":
+        return linear.a + cross(right_p - state.t.T[:, None, :, None], linear.w)
+    if name == "translation":
+        return linear.w
+    if name in ("stereo_rotation", "stereo_translation"):
+        left = torch.arange(linear.r.shape[0], device=linear.r.device)[:, None, None] % 2 == 1
+        return torch.where(left, linear.a + cross(right_p, linear.w) if name == "stereo_rotation" else linear.w, 0.0)
+    if name == "radius":
+        return linear.radius[None]
+    if name == "end_offset":
+        return linear.end[None]
+    if name == "edge_bias":
+        return _shifts(measured, linear.r).transpose(0, 1)
+    return _displaced(name, linear, measured, state)
 
 
 def _displaced(name: str, linear: LinearisedRows, measured: MeasurementRows, state: State) -> Float[Tensor, "q k b n"]:

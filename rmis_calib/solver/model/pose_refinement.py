@@ -18,6 +18,7 @@ from rmis_calib.errors import InputError, ShapeError
 from rmis_calib.geometry.rotations import quat_multiply, rotvec_to_quat
 from rmis_calib.solver.model.batched_linalg import unit_diagonal
 from rmis_calib.solver.model.forward_mode import load_forward_mode
+from rmis_calib.solver.model.implicit import newton_on_graph
 from rmis_calib.solver.status import SolveStatus
 
 Residual = Callable[[Float[Tensor, "*batch 4"], Float[Tensor, "*batch 3"]], Float[Tensor, "*batch m"]]
@@ -106,18 +107,17 @@ def refine(
 def _attached(residual_fn: Residual, found: Refinement, free: Free) -> Refinement:
     """The same poses as functions of the data.
 
-    At the minimum the gradient g(x, data) of half the cost vanishes, so dx = -H^-1 (dg/d data), H the full Hessian
-    (implicit function theorem). A Newton step from there is that function: its value is zero to rounding, its
-    derivative is dx.
+    At the minimum the gradient of half the cost vanishes: that is the equation (implicit.py).
     """
-    q, t, k = found.quaternion, found.translation, found.information.shape[-1]
-    with torch.inference_mode(False), torch.enable_grad():
-        step = torch.zeros((*q.shape[:-1], k), dtype=q.dtype, device=q.device, requires_grad=True)
+    q, t = found.quaternion, found.translation
+
+    def gradient(step: Float[Tensor, "*batch k"]) -> Float[Tensor, "*batch k"]:
         half_cost = 0.5 * residual_fn(*_moved(q, t, step, free)).square().sum()
-        (gradient,) = torch.autograd.grad(half_cost, step, create_graph=True)
-        rows = [torch.autograd.grad(gradient[..., i].sum(), step, retain_graph=True)[0] for i in range(k)]
-        newton = -torch.linalg.solve_ex(torch.stack(rows, dim=-2).detach(), gradient[..., None]).result[..., 0]
-        q, t = _moved(q, t, newton, free)
+        return torch.autograd.grad(half_cost, step, create_graph=True)[0]
+
+    step = newton_on_graph(gradient, found.information[..., 0])
+    with torch.inference_mode(False), torch.enable_grad():
+        q, t = _moved(q, t, step, free)
     return replace(found, quaternion=q, translation=t)
 
 

@@ -204,13 +204,13 @@ def _shaft(p: Float[Tensor, "3 c b n"], d: Float[Tensor, "3 c b n"], head: Float
 def _corrected(measured: MeasurementRows, state: State) -> tuple[Tensor, Tensor, Tensor]:
     """RCM, direction and head vector in `arm` with the estimated offsets applied, to first order in the rotation."""
     p, v, head = measured.p, measured.v, measured.head
-    if bool((state.rcm_offset != 0).any()):
+    if _matters(state.rcm_offset):
         e1, e2 = rcm_axes(measured.R, measured.v)
         p = p + state.rcm_offset[:, 0, None] * e1 + state.rcm_offset[:, 1, None] * e2
     displacement = None
-    if measured.joint is not None and bool((state.joint_offset != 0).any()):
+    if measured.joint is not None and _matters(state.joint_offset):
         displacement = (measured.joint * state.joint_offset.T[:, :, None]).sum(1)
-    if measured.clock is not None and bool((state.clock != 0).any()):
+    if measured.clock is not None and _matters(state.clock):
         moved = measured.clock * state.clock[:, None]
         displacement = moved if displacement is None else displacement + moved
     if displacement is not None:
@@ -218,6 +218,11 @@ def _corrected(measured: MeasurementRows, state: State) -> tuple[Tensor, Tensor,
         v = unit(v + cross(displacement[:3], v))
         head = head + cross(displacement[:3], head)
     return p, v, head
+
+
+def _matters(offset: Tensor) -> bool:
+    """Whether an offset has an effect, or a derivative."""
+    return offset.requires_grad or bool((offset != 0).any())
 
 
 def residual_rows(measured: MeasurementRows, state: State) -> Float[Tensor, "k b n"]:
@@ -261,14 +266,14 @@ def linearise(measured: MeasurementRows, state: State) -> tuple[LinearisedRows, 
         (a, kappa_s * seen.sine, -kappa_s * seen.cosine),
     ):
         out = out[:, part].unflatten(1, (lines, c))
-        torch.mul(along_m, m, out=out).addcmul_(along_u, u)
+        _write(out, along_m, m, along_u, u)
     if measured.has_ends:
         part = slice(lines * c, lines * c + ends)
         e, chi, s_end, gain = _end_geometry(measured, state, shaft)
         gain = torch.where(measured.end_ok, gain, 0.0)
         r[part], end[part] = torch.where(measured.end_ok, e, 0.0), -gain
-        torch.mul(-gain, d[:, 0], out=w[:, part]).addcmul_(gain * chi, u[:, 0])
-        torch.mul(-gain * chi * s_end, m[:, 0], out=a[:, part])
+        _write(w[:, part], -gain, d[:, 0], gain * chi, u[:, 0])
+        a[:, part] = -gain * chi * s_end * m[:, 0]
     if measured.has_heads:
         part = slice(lines * c + ends, None)
         e, w_head = _head_geometry(measured, shaft)
@@ -277,6 +282,14 @@ def linearise(measured: MeasurementRows, state: State) -> tuple[LinearisedRows, 
         r[part] = torch.where(measured.head_ok, e, 0.0).flatten(0, 1)
         w[:, part], a[:, part] = both[:, :2].flatten(1, 2), both[:, 2:].flatten(1, 2)
     return LinearisedRows(r=r, w=w, a=a, radius=radius, end=end), shaft
+
+
+def _write(out: Tensor, x: Tensor, a: Tensor, y: Tensor, b: Tensor) -> None:
+    """Writes x a + y b into `out`; without a temporary, unless autograd looks on."""
+    if x.requires_grad:
+        out.copy_(torch.addcmul(x * a, y, b))
+    else:
+        torch.mul(x, a, out=out).addcmul_(y, b)
 
 
 def _linearise_by_autograd(measured: MeasurementRows, state: State, shaft: Shaft) -> LinearisedRows:
@@ -335,10 +348,10 @@ def _line_geometry(measured: MeasurementRows, state: State, shaft: Shaft, radius
     sine = (measured.line_rho * (state.radius[:, None] / shaft.D)).clamp(-MAX_SINE, MAX_SINE)
     cosine = (1.0 - sine.square()).sqrt()
     n_image = torch.addcmul(cosine * shaft.m[:2, None], sine, shaft.u[:2, None])
-    n_xy = _held(n_image.square().sum(0).sqrt().clamp_min(1e-12))
+    n_xy = _held(measured, n_image.square().sum(0).sqrt().clamp_min(1e-12))
     X_m, X_u, X_d = (_along(axis, x, y) for axis in (shaft.m, shaft.u, shaft.d))
     f = torch.addcmul(cosine * X_m, sine, X_u) / n_xy
-    if bool((state.edge_bias != 0).any()):
+    if _matters(state.edge_bias):
         f = f + state.edge_bias.permute(1, 2, 0)[..., None]
     kappa = torch.addcmul(cosine * X_u, sine, X_m, value=-1.0) / (shaft.D * cosine * n_xy)
     return LineGeometry(f, sine, cosine, kappa, X_d / n_xy - kappa * shaft.s0, n_image / n_xy)
@@ -350,9 +363,9 @@ def _along(axis: Float[Tensor, "3 c b n"], x: Float[Tensor, "*l c b n"], y: Floa
     return torch.addcmul(torch.addcmul(third, first, x), second, y)
 
 
-def _held(value: Tensor) -> Tensor:
+def _held(measured: MeasurementRows, value: Tensor) -> Tensor:
     """The value without its derivative, which is of second order at a small residual (see the top of this file)."""
-    return value.detach()
+    return value if measured.exact else value.detach()
 
 
 def _end_geometry(measured: MeasurementRows, state: State, shaft: Shaft) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -366,11 +379,11 @@ def _end_geometry(measured: MeasurementRows, state: State, shaft: Shaft) -> tupl
     m_xy = image_m.square().sum(0).sqrt().clamp_min(1e-12)
     step = d[:2] - chi * u[:2]
     across = torch.addcmul(step[1] * image_m[0], step[0], image_m[1], value=-1.0)
-    slope = _held((across / m_xy).abs().clamp_min(1e-12) / X_u.abs())
+    slope = _held(measured, (across / m_xy).abs().clamp_min(1e-12) / X_u.abs())
     s_end = (measured.s_end + state.end_offset[:, None]).expand_as(chi)
     gain = (shaft.D * slope).reciprocal()
     if measured.autograd:  # the same value; its derivative is that of the predicted end, seen from a held direction
-        return -dot(_held(d - chi * u), shaft.p + s_end * d) * _held(gain), chi, s_end, gain
+        return -dot(_held(measured, d - chi * u), shaft.p + s_end * d) * _held(measured, gain), chi, s_end, gain
     return (chi - (shaft.s0 + s_end) / shaft.D) / slope, chi, s_end, gain
 
 

@@ -21,7 +21,7 @@ from rmis_calib.geometry.rotations import project_to_so3
 from rmis_calib.solver.model.batched_linalg import batch_last, cross, dot, rotate, rotate_back
 from rmis_calib.solver.model.measurement_rows import MeasurementRows
 from rmis_calib.solver.start.line_statistics import LineStatistics
-from rmis_calib.solver.start.rotation_search import search_rotations, vec
+from rmis_calib.solver.start.rotation_search import on_graph, search_rotations, vec
 
 CHEIRALITY_SLACK = 0.9
 """Minima whose cheirality is at least this part of the best one's compete by cost."""
@@ -95,6 +95,18 @@ def cheirality(
     depth = (statistics.sample_x[:, None] * torch.linalg.cross(d, M)).sum(-1)
     known = torch.isfinite(turn)
     return ((turn > 0) & (depth > 0) & known).sum((-2, -1)) / known.sum((-2, -1)).clamp_min(1)
+
+
+def best_candidate(
+    statistics: LineStatistics, grid: int, minima: int
+) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"]]:
+    """R and t of the best minimum; with derivatives to the statistics, where these have any."""
+    if not statistics.rotation_gram.requires_grad:
+        return find_candidates(statistics, grid, minima).best()[:2]
+    with torch.no_grad():
+        R, *_ = find_candidates(statistics, grid, minima).best()
+    R = on_graph(statistics.rotation_gram.sum(1), R)[:, None]
+    return R[:, 0], lift(statistics, R, solve_translation(statistics, R)[0])[:, 0]
 
 
 def find_candidates(statistics: LineStatistics, grid: int, minima: int) -> Candidates:

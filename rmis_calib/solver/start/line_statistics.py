@@ -123,6 +123,8 @@ def _sums(problem: Problem, trials: slice, motions: slice) -> list[Tensor]:
     axis, T = problem.axis_xy[trials, :, motions], problem.arm_T_rcm[trials, motions]
     x0, y0, x1, y1 = (axis[..., i, j].contiguous() for i in (0, 1) for j in (0, 1))
     ok = torch.isfinite(x0 + y0 + x1 + y1) & problem.valid[trials, :, motions]
+    if axis.requires_grad:  # the derivative of a NaN is NaN, even where it does not count
+        x0, y0, x1, y1 = (torch.where(ok, x, 0.0) for x in (x0, y0, x1, y1))
     n = [y0 - y1, x1 - x0, x0 * y1 - y0 * x1]
     scale = torch.where(ok, (n[0].square() + n[1].square() + n[2].square()).clamp_min(1e-300).rsqrt(), 0.0)
     n = [torch.where(ok, component, 0.0) * scale for component in n]

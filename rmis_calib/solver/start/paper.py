@@ -13,7 +13,7 @@ from rmis_calib.solver.model.pose_refinement import refine
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.start.candidates import solve_translation
 from rmis_calib.solver.start.line_statistics import LineStatistics, plane_normals
-from rmis_calib.solver.start.rotation_search import unvec, vec
+from rmis_calib.solver.start.rotation_search import on_graph, unvec, vec
 
 MIN_LINES = 8
 """Axis lines that a camera needs to vote: Eq. 10 has one solution, up to its scale, from the eighth line on."""
@@ -69,7 +69,9 @@ def refine_quaternion(gram: Float[Tensor, "b 9 9"], R: Float[Tensor, "b 3 3"]) -
 def solve_paper(statistics: LineStatistics) -> tuple[Float[Tensor, "b c 3 3"], Float[Tensor, "b c 3"]]:
     """The estimate of each camera on its own (`camera_right_T_arm` both times)."""
     gram = statistics.rotation_gram.flatten(0, 1)
-    R = refine_quaternion(gram, linear_rotation(gram)).unflatten(0, statistics.rotation_gram.shape[:2])
+    with torch.no_grad():
+        R = refine_quaternion(gram, linear_rotation(gram))
+    R = (on_graph(gram, R) if gram.requires_grad else R).unflatten(0, statistics.rotation_gram.shape[:2])
     t, _ = solve_translation(statistics.apart(), R.flatten(0, 1)[:, None])
     return R, t[:, 0].unflatten(0, R.shape[:2])
 

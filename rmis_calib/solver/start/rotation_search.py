@@ -112,6 +112,20 @@ def _solve3(H: Float[Tensor, "*b 3 3"], g: Float[Tensor, "*b 3"]) -> Float[Tenso
     return torch.stack(((k0 * g).sum(-1), (k1 * g).sum(-1), (k2 * g).sum(-1)), dim=-1) / det
 
 
+def on_graph(gram: Float[Tensor, "b 9 9"], R: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 3"]:
+    """The minimum R of the rotation cost as a function of the Gram matrix: a Newton step from it (model/implicit.py),
+    with the derivatives above."""
+
+    def stepped(gram: Tensor, R: Tensor) -> Tensor:
+        _, gradient, hessian, _ = derivatives(gram, R[:, None])
+        step = -torch.linalg.solve_ex(hessian[:, 0].detach(), gradient[:, 0, :, None]).result[..., 0]
+        return rotvec_to_matrix(step) @ R
+
+    with torch.no_grad():  # to the minimum as exactly as can be told: the search ends earlier
+        R = stepped(gram, stepped(gram, R))
+    return stepped(gram, R)
+
+
 def descend(gram: Float[Tensor, "b 9 9"], R: Float[Tensor, "b g 3 3"], steps: int) -> tuple[Tensor, Tensor]:
     """Every rotation moved to its local minimum: (rotations, costs). A step that raises the cost is not taken."""
     cost, gradient, hessian, gauss_newton = derivatives(gram, R)
