@@ -26,6 +26,7 @@ from .pipeline import (
 from .results import CalibrationResult as CalibrationResult
 from .solver.model.pose_refinement import Refinement as Refinement
 from .solver.model.pose_refinement import refine as refine
+from .solver.own_measurement import Measurement as Measurement
 from .vision import ShaftDetector as ShaftDetector
 
 __version__: str

@@ -1,6 +1,6 @@
 """Observations to the answer: the solver's tensors turned into a result with frames, units and a status."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Literal, overload
 
@@ -23,6 +23,7 @@ from rmis_calib.solver import Problem, Solution, SolveStatus
 from rmis_calib.solver import solve as solve_problem
 from rmis_calib.solver.estimate.relinearise import scan_clock
 from rmis_calib.solver.observability import Observability
+from rmis_calib.solver.own_measurement import Measurement
 from rmis_calib.solver.solution import AlternativeModel, Nuisance
 from rmis_calib.solver.status import MotionReason
 
@@ -48,6 +49,7 @@ def solve(
     config: CalibrationConfig | None = None,
     *,
     throw: bool = True,
+    measurements: Sequence[Measurement] = (),
     differentiable: Literal[False] = False,
 ) -> CalibrationResult: ...
 
@@ -57,6 +59,7 @@ def solve(
     observations: ShaftObservations | Mapping[str, Any],
     config: CalibrationConfig | None = None,
     *,
+    measurements: Sequence[Measurement] = (),
     differentiable: Literal[True],
 ) -> Solution: ...
 
@@ -66,6 +69,7 @@ def solve(
     config: CalibrationConfig | None = None,
     *,
     throw: bool = True,
+    measurements: Sequence[Measurement] = (),
     differentiable: bool = False,
 ) -> CalibrationResult | Solution:
     """Estimate `camera_right_T_arm` from observations.
@@ -75,6 +79,7 @@ def solve(
             tensors, with any leading batch of trials.
         config: method, measurements to use, noise, thresholds; the defaults when None.
         throw: raise when the result is not trustworthy; otherwise its `status` and `message` say so.
+        measurements: of your own, which `joint` uses beside the observations'.
         differentiable: return the solver's tensors, of which `camera_right_T_arm` and `covariance` pass gradients to
             the tensors of the observations (`solver.solve` says what they include). Joint and clock offsets are then
             not estimated, and nothing is raised for trials without a trustworthy answer: `status` and `verdict` say so.
@@ -87,7 +92,7 @@ def solve(
     require_device(config.device)
     if differentiable:
         keys = observations if isinstance(observations, Mapping) else vars(observations)
-        problem = Problem.from_arrays(keys, device=config.device).only(*config.measurements)
+        problem = Problem.from_arrays(keys, device=config.device).only(*config.measurements).with_own(measurements)
         return solve_problem(problem, config.solver, differentiable=True)
     if not isinstance(observations, ShaftObservations):
         raise InputError(
@@ -97,11 +102,16 @@ def solve(
         )
     unknowns = file_unknowns(observations, config.solver, config.device)
     if unknowns is None:
-        solution, notes = estimate(observations, config), ()
+        solution, notes = estimate(observations, config, measurements), ()
     else:
-        solution, notes = estimate_with_kinematics(observations, config, unknowns, unknowns.clock_at_s)
+        at = unknowns.clock_at_s
+        solution, notes = estimate_with_kinematics(observations, config, unknowns, at, measurements)
     motions = Motions(*used_motions(solution))
     residuals, columns = residuals_normalised(solution, motions.used), () if unknowns is None else unknowns.columns
+    for item in measurements:
+        if item.name in solution.residual_own:
+            by_motion = solution.residual_own[item.name].cpu().numpy()
+            residuals[item.name] = residual_record(by_motion, item.unit, motions.used)
     result = make_result(solution, motions, residuals, config, columns, notes)
     advice = _advice(solution, motions, observations, config, unknowns)
     result = replace(result, observability=result.observability | advice)
@@ -130,9 +140,11 @@ def _advice(
     return advice_record(solution, candidates, seen_view(problem), config, WHERE)
 
 
-def estimate(observations: ShaftObservations, config: CalibrationConfig) -> Solution:
-    """Run the configured solver on the configured kinds of measurement."""
-    return solve_problem(problem_of(observations, config), config.solver)
+def estimate(
+    observations: ShaftObservations, config: CalibrationConfig, measurements: Sequence[Measurement] = ()
+) -> Solution:
+    """Run the configured solver on the configured kinds of measurement, and on the user's own."""
+    return solve_problem(problem_of(observations, config).with_own(measurements), config.solver)
 
 
 def estimate_with_kinematics(
@@ -140,6 +152,7 @@ def estimate_with_kinematics(
     config: CalibrationConfig,
     unknowns: KinematicUnknowns | FileUnknowns,
     clock_s: float | None = None,
+    measurements: Sequence[Measurement] = (),
 ) -> tuple[Solution, tuple[str, ...]]:
     """The same with constant joint offsets, and the clock offset, among the unknowns of `joint`; and what was decided
     about the offsets, in sentences.
@@ -153,8 +166,9 @@ def estimate_with_kinematics(
         config: method, measurements to use, noise, unknowns.
         unknowns: the kinematics as a function of the offsets.
         clock_s: clock offset found before, to start from; None: it is searched for.
+        measurements: of the user's own.
     """
-    base = problem_of(observations, config).flatten_batch()
+    base = problem_of(observations, config).with_own(measurements).flatten_batch()
     asked = config.solver.unknowns
     sigma = unknowns.prior_sigma(asked)
     if asked.joint_offsets == "never":

@@ -1,5 +1,6 @@
 from .api import solve as solve
 from .observability import Verdict as Verdict
+from .own_measurement import Measurement as Measurement
 from .problem import NoiseLevels as NoiseLevels
 from .problem import Problem as Problem
 from .settings import SolverSettings as SolverSettings

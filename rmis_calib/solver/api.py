@@ -1,6 +1,7 @@
 """One call from a problem to a solution."""
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -183,7 +184,8 @@ def _spread(solution: Solution, index: Int[Tensor, " k"], n: int) -> Solution:
         return out
 
     names = ("residual_lines", "residual_ends", "residual_heads", "distance")
-    values = {name: spread(getattr(solution, name), torch.nan) for name in names}
+    values: dict[str, Any] = {name: spread(getattr(solution, name), torch.nan) for name in names}
+    values["residual_own"] = {name: spread(value, torch.nan) for name, value in solution.residual_own.items()}
     return replace(solution, reason=spread(solution.reason, int(MotionReason.THINNED)), **values)
 
 

@@ -4,7 +4,7 @@ Axes: any leading trial batch, then the camera (0 right, 1 left) where a tensor 
 that is absent is NaN and not valid. Units: mm, rad, s; image coordinates are normalised and undistorted (x/z, y/z).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -13,7 +13,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rmis_calib.errors import InsufficientDataError, ObservationsError
+from rmis_calib.errors import InputError, InsufficientDataError, ObservationsError
+from rmis_calib.solver.own_measurement import Measurement
 
 MIN_MOTIONS = 3
 CAMERAS = ("right", "left")
@@ -73,6 +74,7 @@ class Problem:
         clock_derivative: the same displacement per second of clock offset, [motion, 6].
         joint_offset_at: joint offsets at which the kinematics here were evaluated; None: zero.
         clock_at: clock offset, s, likewise.
+        own: measurements of the user's own.
     """
 
     arm_T_rcm: Float[Tensor, "*batch n 4 4"]
@@ -96,6 +98,7 @@ class Problem:
     clock_derivative: Float[Tensor, "*batch n 6"] | None = None
     joint_offset_at: Float[Tensor, "*batch j"] | None = None
     clock_at: Float[Tensor, "*batch"] | None = None
+    own: tuple[Measurement, ...] = ()
 
     @property
     def batch_shape(self) -> torch.Size:
@@ -112,6 +115,25 @@ class Problem:
     @property
     def n_trials(self) -> int:
         return self.batch_shape.numel()
+
+    def with_own(self, own: Sequence[Measurement]) -> "Problem":
+        """The problem with measurements of the user's own.
+
+        Raises:
+            InputError: two of one name, one of a camera that is not there, or values that do not fit the motions.
+        """
+        names = [item.name for item in own]
+        if len(set(names)) < len(names):
+            raise InputError(where="measurements", expected="different names", found=", ".join(names))
+        for item in own:
+            if item.camera == "left" and self.n_cameras < 2:
+                raise InputError(
+                    where=f"measurement {item.name!r}", expected="two cameras", found="the right one alone"
+                )
+        like = self.arm_T_rcm
+        return replace(
+            self, own=tuple(item.as_tensors(self.batch_shape, self.n_motions, like.dtype, like.device) for item in own)
+        )
 
     def only(self, *kinds: str) -> "Problem":
         """The problem with these kinds of measurement alone (`axis`, `contours`, `ends`, `heads`)."""
@@ -167,11 +189,12 @@ class Problem:
             "valid",
         }
         constant = {"camera_T_camera_right", "radius_mm", "joint_offset_sigma", "joint_offset_at", "clock_at"}
-        changed = {}
+        changed: dict[str, Any] = {}
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(value, Tensor) and field.name not in constant:
                 changed[field.name] = function(value, k + (field.name in after_camera))
+        changed["own"] = tuple(own.map_tensors(lambda x: function(x, k)) for own in self.own)
         return replace(self, **changed)
 
     @classmethod
@@ -326,4 +349,6 @@ def _map_tensors(value: Any, function: Any) -> Any:
             changed[field.name] = function(item, field.name)
         elif isinstance(item, NoiseLevels):
             changed[field.name] = _map_tensors(item, function)
+        elif isinstance(item, tuple):
+            changed[field.name] = tuple(own.map_tensors(lambda x: function(x, "own")) for own in item)
     return replace(value, **changed)

@@ -1,7 +1,7 @@
 """What a solve returns: the estimate, its uncertainty, a status with a sentence, and what the data cannot see."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
 import torch
@@ -73,6 +73,7 @@ class Solution:
             where unknown.
         residual_lines, residual_ends, residual_heads: rms per camera and motion, normalised units; NaN where not
             measured.
+        residual_own: the same of the user's own measurements, by name, in their unit.
         distance: Mahalanobis distance of each motion over the root of its rows; NaN where not measured.
         reason: `MotionReason` codes.
         noise: levels that were used, name -> value (`image`, `ends`, `heads` as factors on the nominal ones).
@@ -101,6 +102,7 @@ class Solution:
     nuisances: dict[str, Nuisance]
     bias: Float[Tensor, "*batch 6"]
     observability: ObservabilityTensors
+    residual_own: dict[str, Float[Tensor, "*batch n"]] = field(default_factory=dict)
     posterior: Posterior | None = None
     history: tuple[Float[Tensor, "..."], ...] = ()
     information_kept: float = 1.0

@@ -77,6 +77,7 @@ def two_step_solution(
         residual_lines=shown.lines,
         residual_ends=shown.ends,
         residual_heads=shown.heads,
+        residual_own=shown.own,
     )
 
 
@@ -130,6 +131,7 @@ def joint_solution(fit: MapEstimate, settings: SolverSettings, alternative: Alte
         residual_lines=shown.lines,
         residual_ends=shown.ends,
         residual_heads=shown.heads,
+        residual_own=shown.own,
     )
 
 
@@ -271,11 +273,13 @@ def _observability(
 
 @dataclass(frozen=True)
 class _Residuals:
-    """Root mean square residuals per camera and motion of each kind; NaN where not measured."""
+    """Root mean square residuals per camera and motion of each kind; NaN where not measured. Those of the user's own
+    measurements by name, of their camera."""
 
     lines: Float[Tensor, "b c n"]
     ends: Float[Tensor, "b c n"]
     heads: Float[Tensor, "b c n"]
+    own: dict[str, Float[Tensor, "b n"]]
 
 
 def _residuals(measured: MeasurementRows, state: State) -> _Residuals:
@@ -284,15 +288,20 @@ def _residuals(measured: MeasurementRows, state: State) -> _Residuals:
     parts = [
         _residuals_of(measured.narrow(slice(None), slice(n, n + step)), state) for n in range(0, measured.motions, step)
     ]
-    return _Residuals(*(torch.cat([part[i] for part in parts], dim=-1) for i in range(3)))
+    lines, ends, heads, *own = (torch.cat(each, dim=-1) for each in zip(*parts, strict=True))
+    names = [(rows.name, rows.camera) for rows in measured.own]
+    by_name = {name: value[:, camera] for (name, camera), value in zip(names, own, strict=True)}
+    return _Residuals(lines, ends, heads, by_name)
 
 
 def _residuals_of(measured: MeasurementRows, state: State) -> list[Float[Tensor, "b c n"]]:
-    """Lines, ends and heads of motions that fit into memory at once; rows take turns between the cameras."""
+    """Lines, ends, heads and each of the user's own, of motions that fit into memory at once; rows take turns between
+    the cameras."""
     squares, ok, c = residual_rows(measured, state).square_(), measured.rows_ok, measured.cameras
+    widths = [measured.row_kind.count(kind) for kind in (LINE, END, HEAD)] + [c * len(rows.ok) for rows in measured.own]
     out, start = [], 0
-    for kind in (LINE, END, HEAD):
-        part = slice(start, start + measured.row_kind.count(kind))
+    for width in widths:
+        part = slice(start, start + width)
         total, count = (x[part].unflatten(0, (-1, c)).sum(0) for x in (squares, ok))
         out.append(torch.where(count > 0, (total / count.clamp_min(1)).sqrt(), torch.nan).transpose(0, 1))
         start = part.stop

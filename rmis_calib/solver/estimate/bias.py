@@ -22,10 +22,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rmis_calib.geometry.rotations import rotvec_to_matrix
 from rmis_calib.solver.model.batched_linalg import cross, dot, unit
 from rmis_calib.solver.model.measurement_rows import LINE, MeasurementRows
 from rmis_calib.solver.model.normal_equations import NoiseModel, WeightedModel, image_variance, normal_equations
-from rmis_calib.solver.model.residuals import Shaft, State, _line_geometry, predict_shaft
+from rmis_calib.solver.model.residuals import Shaft, State, _line_geometry, own_rows, predict_shaft, shaft_poses
 
 SIMULATED_PART = 16
 """One motion in so many is simulated in long recordings: the expected score is then known to about a fifth of its
@@ -62,6 +63,7 @@ class _Draws:
         self.line = draw(*measured.line_rho.shape[:2])
         self.end = draw(2, measured.end_xy.shape[1])
         self.head = draw(2, measured.head_xy.shape[1])
+        self.own = [draw(len(rows.ok)) for rows in measured.own]
 
 
 def simulate(measured: MeasurementRows, state: State, noise: NoiseModel, draws: "_Draws") -> MeasurementRows:
@@ -97,8 +99,19 @@ def simulate(measured: MeasurementRows, state: State, noise: NoiseModel, draws: 
         simulated = replace(simulated, end_xy=q[:2] / q[2] + sigma[lines : lines + ends] * draws.end)
     if measured.has_heads:
         q = seen.p + seen.head
-        simulated = replace(simulated, head_xy=q[:2] / q[2] + sigma[lines + ends :].view_as(draws.head) * draws.head)
-    return simulated
+        heads = sigma[lines + ends : lines + ends + draws.head[:, :, 0, 0].numel()].view_as(draws.head)
+        simulated = replace(simulated, head_xy=q[:2] / q[2] + heads * draws.head)
+    own = []
+    for rows, draw in zip(measured.own, draws.own, strict=True):
+        c = rows.camera
+        R, t = shaft_poses(rows, measured, state)
+        seen_R, p_before, p_after = (x[:, c].permute(1, 2, 0) for x in (phi, shaft.p, p))
+        seen_R = rotvec_to_matrix(seen_R)
+        seen_t = p_after + (seen_R @ (t - p_before)[..., None])[..., 0]
+        shift = rows.var.sqrt() * draw - own_rows(rows, seen_R @ R, seen_t)
+        moved = scaled(noise.kinematics_mm, draws.shift)
+        own.append(replace(rows, shift=rows.shift + shift, turn=turn, moved=moved))
+    return replace(simulated, own=tuple(own))
 
 
 def expected_score(model: WeightedModel, state: State, simulated_motions: int, seed: int) -> ScoreBias:

@@ -1,24 +1,70 @@
 """A problem packed for the inner loops: component first, trials and motions last, one row for each scalar measurement.
 
 A row is a *line* row (an image point that lies on a contour, `rho` = +1 or -1, or on the axis, `rho` = 0), an *end* row
-(where the shaft stops along its axis) or one of two *head* rows. Where a camera measured both contours of a motion, its
-axis line is dropped: detectors derive the one from the other, and counting both would claim information twice.
+(where the shaft stops along its axis), one of two *head* rows, or a component of a measurement of the user's *own*.
+Where a camera measured both contours of a motion, its axis line is dropped: detectors derive the one from the other,
+and counting both would claim information twice.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from rmis_calib.errors import ShapeError
 from rmis_calib.solver.model.batched_linalg import batch_last, rotate
-from rmis_calib.solver.problem import Problem
+from rmis_calib.solver.own_measurement import Measurement, OwnResidual
+from rmis_calib.solver.problem import CAMERAS, Problem
 from rmis_calib.solver.settings import NoiseSettings
 
-LINE, END, HEAD = 0, 1, 2
+LINE, END, HEAD, OWN = 0, 1, 2, 3
 MIN_SIGMA = 1e-6
 """Least image noise, normalised units (a thousandth of a pixel): exact data are not a division by zero."""
+
+
+@dataclass(frozen=True)
+class OwnRows:
+    """A measurement of the user's own, packed.
+
+    Attributes:
+        name: of the measurement.
+        residual: see `OwnResidual`.
+        camera: number of the camera.
+        values: by argument, (..., b, n).
+        var, ok: variance of each component, and where it was measured.
+        shift: added to the residual; not zero in simulations only, like the next two.
+        turn, moved: noise of the kinematics in the values: rotation about the RCM, rad, and translation, mm, in `arm`.
+    """
+
+    name: str
+    residual: OwnResidual
+    camera: int
+    values: dict[str, Tensor]
+    var: Float[Tensor, "m b n"]
+    ok: Bool[Tensor, "m b n"]
+    shift: Float[Tensor, "m b n"]
+    turn: Float[Tensor, "3 b n"]
+    moved: Float[Tensor, "3 b n"]
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> "OwnRows":
+        """With a function applied to all tensors."""
+        return OwnRows(
+            self.name,
+            self.residual,
+            self.camera,
+            {key: function(value) for key, value in self.values.items()},
+            *(function(x) for x in (self.var, self.ok, self.shift, self.turn, self.moved)),
+        )
+
+    def among(self, cameras: int, rows: Tensor) -> Tensor:
+        """Rows (..., m, b, n) between those of the other camera, which are zero: (..., m c, b, n)."""
+        other = torch.zeros_like(rows)
+        each = [rows if c == self.camera else other for c in range(cameras)]
+        return torch.stack(each, dim=-3).flatten(-4, -3)
 
 
 @dataclass(frozen=True)
@@ -40,6 +86,7 @@ class MeasurementRows:
         camera_t: its translation.
         joint: displacement of the shaft per unit of joint offset, in `arm`; None where unknown.
         clock: displacement per second, in `arm`.
+        own: measurements of the user's own.
         autograd: whether `residuals.linearise` takes the derivatives from autograd.
         exact: whether autograd also differentiates what the analytic derivatives hold (residuals.py): for the
             derivative of the estimate, not of a residual.
@@ -64,6 +111,7 @@ class MeasurementRows:
     camera_t: Float[Tensor, "3 c b"]
     joint: Float[Tensor, "6 j b n"] | None = None
     clock: Float[Tensor, "6 b n"] | None = None
+    own: tuple[OwnRows, ...] = ()
     autograd: bool = False
     exact: bool = False
 
@@ -92,66 +140,62 @@ class MeasurementRows:
         return self.head_xy.shape[1] > 0
 
     @property
+    def own_components(self) -> int:
+        return sum(len(rows.ok) for rows in self.own)
+
+    @property
     def row_camera(self) -> tuple[int, ...]:
         """Camera of each row."""
         cameras = tuple(range(self.cameras))
-        return cameras * (self.line_xy.shape[1] + self.has_ends + 2 * self.has_heads)
+        return cameras * (self.line_xy.shape[1] + self.has_ends + 2 * self.has_heads + self.own_components)
 
     @cached_property
     def row_kind(self) -> tuple[int, ...]:
-        """LINE, END or HEAD of each row."""
+        """LINE, END, HEAD or OWN of each row."""
         c = self.cameras
-        return (LINE,) * (self.line_xy.shape[1] * c) + (END,) * (c * self.has_ends) + (HEAD,) * (2 * c * self.has_heads)
+        lines, ends, heads = self.line_xy.shape[1] * c, c * self.has_ends, 2 * c * self.has_heads
+        return (LINE,) * lines + (END,) * ends + (HEAD,) * heads + (OWN,) * (c * self.own_components)
 
     @cached_property
     def rows_ok(self) -> Bool[Tensor, "k b n"]:
         heads = self.head_ok.repeat(2, 1, 1) if self.has_heads else self.head_ok
-        return torch.cat((self.line_ok.flatten(0, 1), self.end_ok, heads))
+        own = [rows.among(self.cameras, rows.ok) for rows in self.own]
+        return torch.cat((self.line_ok.flatten(0, 1), self.end_ok, heads, *own))
 
     @cached_property
     def rows_var(self) -> Float[Tensor, "k b n"]:
         heads = self.head_var.repeat(2, 1, 1) if self.has_heads else self.head_var
-        return torch.cat((self.line_var.flatten(0, 1), self.end_var, heads))
+        own = [rows.among(self.cameras, rows.var) for rows in self.own]
+        return torch.cat((self.line_var.flatten(0, 1), self.end_var, heads, *own))
 
     def narrow(self, trials: slice, motions: slice) -> "MeasurementRows":
         """The part of these trials and motions."""
         if trials.indices(self.trials) == (0, self.trials, 1) and motions.indices(self.motions) == (0, self.motions, 1):
             return self
-        part = {}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name in ("camera_R", "camera_t"):
-                part[field.name] = value[..., trials]
-            elif isinstance(value, Tensor):
-                part[field.name] = value[..., trials, motions]
-        return replace(self, **part)
+        return self._map(lambda x: x[..., trials, motions], lambda x: x[..., trials])
 
     def take_motions(self, index: Tensor) -> "MeasurementRows":
         """The part of the motions `index`, the same for every trial."""
-        fixed = ("camera_R", "camera_t")
-        names = [f.name for f in fields(self) if f.name not in fixed and isinstance(getattr(self, f.name), Tensor)]
-        return replace(self, **{name: getattr(self, name)[..., index] for name in names})
+        return self._map(lambda x: x[..., index], lambda x: x)
 
     def gather(self, trial: Tensor, motion: Tensor) -> "MeasurementRows":
         """Single motions (trial[i], motion[i]) as trials of one motion each."""
-        part = {}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name in ("camera_R", "camera_t"):
-                part[field.name] = value[..., trial]
-            elif isinstance(value, Tensor):
-                part[field.name] = value[..., trial, motion][..., None]
-        return replace(self, **part)
+        return self._map(lambda x: x[..., trial, motion][..., None], lambda x: x[..., trial])
 
     def take_trials(self, index: Tensor) -> "MeasurementRows":
         """The trials `index`, in this order, repeated where it repeats them."""
-        part = {}
+        return self._map(lambda x: x.index_select(x.ndim - 2, index), lambda x: x.index_select(x.ndim - 1, index))
+
+    def _map(self, of_motions: Callable[[Tensor], Tensor], of_trials: Callable[[Tensor], Tensor]) -> "MeasurementRows":
+        """With a function applied to all tensors (..., b, n), another to those (..., b)."""
+        changed: dict[str, Any] = {}
         for field in fields(self):
             value = getattr(self, field.name)
-            if isinstance(value, Tensor):
-                dim = value.ndim - (1 if field.name in ("camera_R", "camera_t") else 2)
-                part[field.name] = value.index_select(dim, index)
-        return replace(self, **part)
+            if field.name in ("camera_R", "camera_t"):
+                changed[field.name] = of_trials(value)
+            elif isinstance(value, Tensor):
+                changed[field.name] = of_motions(value)
+        return replace(self, **changed, own=tuple(rows.map(of_motions) for rows in self.own))
 
     def repeat_trials(self, times: int) -> "MeasurementRows":
         """Every trial `times` times, neighbours together."""
@@ -166,6 +210,7 @@ class MeasurementRows:
             line_ok=self.line_ok & camera_ok,
             end_ok=self.end_ok & camera_ok if self.has_ends else self.end_ok,
             head_ok=self.head_ok & camera_ok if self.has_heads else self.head_ok,
+            own=tuple(replace(rows, ok=rows.ok & camera_ok[rows.camera]) for rows in self.own),
         )
 
 
@@ -208,7 +253,35 @@ def pack(problem: Problem, noise: NoiseSettings) -> MeasurementRows:
         camera_t=camera[:3, 3],
         joint=joint,
         clock=clock,
+        own=tuple(_own(problem, item) for item in problem.own),
     )
+
+
+def _own(problem: Problem, item: Measurement) -> OwnRows:
+    """A measurement of the user's own, packed; its residual at the identity tells how many components it has.
+
+    Raises:
+        ShapeError: the residual does not keep the motions apart.
+    """
+    measured = torch.isfinite(item.sigma)
+    for value in item.values.values():
+        measured = (
+            measured & torch.isfinite(value).flatten(2).all(-1) if value.ndim > 2 else measured & value.isfinite()
+        )
+    values = {key: torch.nan_to_num(value) for key, value in item.values.items()}
+    like, shape = problem.arm_T_rcm, tuple(item.sigma.shape)
+    eye = torch.eye(3, dtype=like.dtype, device=like.device).expand(*shape, 3, 3)
+    probe = item.residual(eye, like.new_ones((*shape, 3)), **values)
+    if probe.ndim != 3 or probe.shape[:2] != shape:
+        raise ShapeError(
+            where=f"measurement {item.name!r}", expected=f"residuals {(*shape, 'm')}", found=tuple(probe.shape)
+        )
+    m = probe.shape[-1]
+    packed = {key: value.movedim((0, 1), (-2, -1)) for key, value in values.items()}
+    variance = torch.where(measured, item.sigma, 1.0).square()
+    rows = [x.expand(m, *shape) for x in (variance, measured, torch.zeros_like(variance))]
+    still = like.new_zeros((3, *shape))
+    return OwnRows(item.name, item.residual, CAMERAS.index(item.camera), packed, *rows, turn=still, moved=still)
 
 
 def line_points(problem: Problem) -> int:

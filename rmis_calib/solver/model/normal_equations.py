@@ -17,7 +17,7 @@ from torch import Tensor
 
 from rmis_calib.errors import InputError
 from rmis_calib.solver.model.batched_linalg import eliminate, forward_substitute
-from rmis_calib.solver.model.measurement_rows import END, HEAD, LINE, MeasurementRows
+from rmis_calib.solver.model.measurement_rows import END, HEAD, LINE, OWN, MeasurementRows
 from rmis_calib.solver.model.parameters import ParameterLayout, columns
 from rmis_calib.solver.model.residuals import LinearisedRows, State, linearise
 
@@ -136,7 +136,7 @@ class Normal:
 
 def image_variance(measured: MeasurementRows, noise: NoiseModel) -> Float[Tensor, "k b n"]:
     """D: nominal variances times the factor of each kind; 1 for rows that were not measured (they are zero)."""
-    factors = {LINE: noise.line, END: noise.end, HEAD: noise.head}
+    factors = {LINE: noise.line, END: noise.end, HEAD: noise.head, OWN: torch.ones_like(noise.line)}
     scale = torch.stack([factors[kind] for kind in measured.row_kind])
     return torch.where(measured.rows_ok, measured.rows_var * scale[:, :, None], 1.0)
 

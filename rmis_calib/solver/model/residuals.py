@@ -51,7 +51,7 @@ from rmis_calib.errors import InputError
 from rmis_calib.geometry.rotations import rotvec_to_matrix
 from rmis_calib.solver.model.batched_linalg import cross, dot, rotate_trials, unit
 from rmis_calib.solver.model.forward_mode import load_forward_mode
-from rmis_calib.solver.model.measurement_rows import MeasurementRows
+from rmis_calib.solver.model.measurement_rows import MeasurementRows, OwnRows
 
 MAX_SINE = 0.99
 """Clamp of r/D. A shaft nearer than that would touch the lens; only trial steps get there."""
@@ -185,7 +185,7 @@ def rcm_axes(
 
 def predict_shaft(measured: MeasurementRows, state: State) -> Shaft:
     """The shaft in the frame of each camera."""
-    arm_p, arm_v, arm_head = _corrected(measured, state)
+    arm_p, arm_v, arm_head, _ = _corrected(measured, state)
     camera_R, camera_t = camera_poses(measured, state)
     R = camera_R @ state.R[:, None]
     t = (camera_R @ state.t[:, None, :, None])[..., 0] + camera_t
@@ -201,8 +201,9 @@ def _shaft(p: Float[Tensor, "3 c b n"], d: Float[Tensor, "3 c b n"], head: Float
     return Shaft(p=p, d=d, m=M / D, u=torch.addcmul(p, s0, d, value=-1.0) / D, D=D, s0=s0, head=head)
 
 
-def _corrected(measured: MeasurementRows, state: State) -> tuple[Tensor, Tensor, Tensor]:
-    """RCM, direction and head vector in `arm` with the estimated offsets applied, to first order in the rotation."""
+def _corrected(measured: MeasurementRows, state: State) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """RCM, direction and head vector in `arm` with the estimated offsets applied, to first order in the rotation; and
+    that rotation."""
     p, v, head = measured.p, measured.v, measured.head
     if _matters(state.rcm_offset):
         e1, e2 = rcm_axes(measured.R, measured.v)
@@ -217,7 +218,7 @@ def _corrected(measured: MeasurementRows, state: State) -> tuple[Tensor, Tensor,
         p = p + displacement[3:]
         v = unit(v + cross(displacement[:3], v))
         head = head + cross(displacement[:3], head)
-    return p, v, head
+    return p, v, head, torch.zeros_like(p) if displacement is None else displacement[:3]
 
 
 def _matters(offset: Tensor) -> bool:
@@ -227,17 +228,19 @@ def _matters(offset: Tensor) -> bool:
 
 def residual_rows(measured: MeasurementRows, state: State) -> Float[Tensor, "k b n"]:
     """Residuals alone."""
-    return _rows(measured, state, predict_shaft(measured, state))
+    shaft = predict_shaft(measured, state)
+    own = [rows.among(measured.cameras, own_rows(rows, *shaft_poses(rows, measured, state))) for rows in measured.own]
+    return torch.where(measured.rows_ok, torch.cat((_rows(measured, state, shaft), *own)), 0.0)
 
 
 def _rows(measured: MeasurementRows, state: State, shaft: Shaft) -> Float[Tensor, "k b n"]:
-    """Residuals of a shaft wherever it is; its radius, end and edges are those of the state."""
+    """Residuals of what is built in, of a shaft wherever it is; its radius, end and edges are those of the state."""
     parts = [_line_geometry(measured, state, shaft).f.flatten(0, 1)]
     if measured.has_ends:
         parts.append(_end_geometry(measured, state, shaft)[0])
     if measured.has_heads:
         parts.append(_head_geometry(measured, shaft)[0].flatten(0, 1))
-    return torch.where(measured.rows_ok, torch.cat(parts), 0.0)
+    return torch.cat(parts)
 
 
 def linearise(measured: MeasurementRows, state: State) -> tuple[LinearisedRows, Shaft]:
@@ -247,8 +250,13 @@ def linearise(measured: MeasurementRows, state: State) -> tuple[LinearisedRows, 
     are combinations of the axes m, u and d, which alone are turned into `camera_right`.
     """
     shaft = predict_shaft(measured, state)
-    if measured.autograd:
-        return _linearise_by_autograd(measured, state, shaft), shaft
+    built_in = _linearise_by_autograd if measured.autograd else _linearise_analytically
+    linear = built_in(measured, state, shaft)
+    return _with_own(linear, measured, state, shaft) if measured.own else linear, shaft
+
+
+def _linearise_analytically(measured: MeasurementRows, state: State, shaft: Shaft) -> LinearisedRows:
+    """What is built in, by the formulas at the top of this file."""
     camera_R, _ = camera_poses(measured, state)
     m, u, d = _into_right(camera_R, torch.stack((shaft.m, shaft.u, shaft.d), dim=1)).unsqueeze(2).unbind(1)
     lines, c = measured.line_xy.shape[1], measured.cameras
@@ -281,7 +289,7 @@ def linearise(measured: MeasurementRows, state: State) -> tuple[LinearisedRows, 
         both = torch.where(measured.head_ok, _into_right(camera_R, both), 0.0)
         r[part] = torch.where(measured.head_ok, e, 0.0).flatten(0, 1)
         w[:, part], a[:, part] = both[:, :2].flatten(1, 2), both[:, 2:].flatten(1, 2)
-    return LinearisedRows(r=r, w=w, a=a, radius=radius, end=end), shaft
+    return LinearisedRows(r=r, w=w, a=a, radius=radius, end=end)
 
 
 def _write(out: Tensor, x: Tensor, a: Tensor, y: Tensor, b: Tensor) -> None:
@@ -314,14 +322,67 @@ def _linearise_by_autograd(measured: MeasurementRows, state: State, shaft: Shaft
         effect = forward_ad.unpack_dual(rows(forward_ad.make_dual(torch.zeros_like(tangent), tangent))).tangent
         if effect is None:
             raise InputError(where="residuals", expected="rows that depend on the shaft", found="none")
-        effect = torch.where(many.rows_ok, effect, 0.0).unflatten(1, (steps, b)).transpose(0, 1)
-    return LinearisedRows(_rows(measured, state, shaft), effect[:3], effect[3:6], effect[6], effect[7])
+        effect = torch.where(many.rows_ok[: len(effect)], effect, 0.0).unflatten(1, (steps, b)).transpose(0, 1)
+    r = _rows(measured, state, shaft)
+    r = torch.where(measured.rows_ok[: len(r)], r, 0.0)
+    return LinearisedRows(r, effect[:3], effect[3:6], effect[6], effect[7])
+
+
+def _with_own(linear: LinearisedRows, measured: MeasurementRows, state: State, shaft: Shaft) -> LinearisedRows:
+    """The rows with those of the user's own measurements, whose effects come from forward-mode autograd: six steps of
+    the shaft side by side, three of a translation and three of a rotation about the RCM, in `camera_right`."""
+    camera_R, _ = camera_poses(measured, state)
+    parts = {name: [getattr(linear, name)] for name in ("r", "w", "a", "radius", "end")}
+    on_graph = torch.is_grad_enabled() and not torch.is_inference_mode_enabled()
+    load_forward_mode()
+    for rows in measured.own:
+        R, t = shaft_poses(rows, measured, state)
+        axes = camera_R[:, rows.camera].permute(2, 0, 1)  # those of `camera_right`, (3, b, 3)
+        axes = axes[:, :, None].expand(3, *t.shape)
+        p = shaft.p[:, rows.camera].permute(1, 2, 0)
+        dR = torch.cat((R.new_zeros((3, *R.shape)), torch.linalg.cross(axes[..., None], R.expand(3, *R.shape), dim=-2)))
+        dt = torch.cat((axes, torch.linalg.cross(axes, (t - p).expand(3, *t.shape), dim=-1)))
+        values = {key: value.movedim((-2, -1), (0, 1)) for key, value in rows.values.items()}
+        with torch.inference_mode(False), torch.set_grad_enabled(on_graph), forward_ad.dual_level():
+            many_R = forward_ad.make_dual(R.expand(6, *R.shape).clone(), dR.clone())
+            many_t = forward_ad.make_dual(t.expand(6, *t.shape).clone(), dt.clone())
+            value, effect = forward_ad.unpack_dual(rows.residual(many_R, many_t, **values))
+        if effect is None:
+            raise InputError(where="own measurement", expected="a residual that depends on the transform", found="none")
+        r = value[0].movedim(-1, 0) + rows.shift
+        effect = torch.where(rows.ok, effect.movedim(-1, 1), 0.0)
+        zero = torch.zeros_like(r)
+        found = {"r": torch.where(rows.ok, r, 0.0), "w": effect[:3], "a": effect[3:], "radius": zero, "end": zero}
+        for name, value in found.items():
+            parts[name].append(rows.among(measured.cameras, value))
+    return LinearisedRows(**{name: torch.cat(part, dim=-3) for name, part in parts.items()})
 
 
 def _into_right(camera_R: Float[Tensor, "b c 3 3"], v: Float[Tensor, "3 m c b n"]) -> Float[Tensor, "3 m c b n"]:
     """Vectors of each camera's frame turned into `camera_right`."""
     back = camera_R.permute(1, 0, 3, 2).expand(v.shape[1], -1, -1, -1, -1).flatten(0, 2)
     return torch.matmul(back, v.flatten(1, 3).transpose(0, 1)).transpose(0, 1).unflatten(1, v.shape[1:4])
+
+
+def own_rows(rows: OwnRows, R: Float[Tensor, "b n 3 3"], t: Float[Tensor, "b n 3"]) -> Float[Tensor, "m b n"]:
+    """Residuals of one measurement of the user's own, from `shaft_poses`."""
+    values = {key: value.movedim((-2, -1), (0, 1)) for key, value in rows.values.items()}
+    return rows.residual(R, t, **values).movedim(-1, 0) + rows.shift
+
+
+def shaft_poses(
+    rows: OwnRows, measured: MeasurementRows, state: State
+) -> tuple[Float[Tensor, "b n 3 3"], Float[Tensor, "b n 3"]]:
+    """`camera_T_arm` for every motion, by which what `arm` tells of the instrument comes to be where the offsets move
+    it: x -> p' + exp(phi) (x - p), for a displacement of the shaft that takes the RCM from p to p'."""
+    p, _, _, phi = _corrected(measured, state)
+    camera_R, camera_t = (x[:, rows.camera] for x in camera_poses(measured, state))
+    R = camera_R @ state.R
+    t = (camera_R @ state.t[..., None])[..., 0] + camera_t
+    before, after, turn, first = (x.permute(1, 2, 0) for x in (measured.p - rows.moved, p, phi, rows.turn))
+    turned = rotvec_to_matrix(turn) @ rotvec_to_matrix(first)
+    shift = after - (turned @ before[..., None])[..., 0]
+    return R[:, None] @ turned, (R[:, None] @ shift[..., None])[..., 0] + t[:, None]
 
 
 @dataclass(frozen=True)
