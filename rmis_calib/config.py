@@ -47,7 +47,9 @@ class CalibrationConfig:
     model_sigma_px: float = 0.3
     """What the picture model leaves out (lens, glare, compression, a shaft not quite round): 1 sigma, px, added in
     quadrature to what the detector claims for a contour or an end. Without it sharp pictures outvote the kinematics: on
-    the real recording of the tests the answer is 9.8 mm from the reference, with 0.3 px 3.6 mm, with 0.7 px 2.6 mm."""
+    the real recording of the tests the answer is 9.8 mm from the reference, with 0.3 px 3.6 mm, with 0.7 px 2.6 mm.
+    It is where the estimated noise level sets out from, not a floor: where the lines fit better the level falls (the
+    demo ends at a twentieth of it), unless `solver.noise.estimate` is `never`."""
     edge_bias_px: float = 0.02
     """Error of a contour point that every picture of a camera shares (lens model, edge detector), 1 sigma, px. It does
     not average out, so each is an unknown with this prior. 0.02 to 0.04 px were measured on rendered pictures;

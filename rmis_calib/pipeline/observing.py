@@ -53,8 +53,8 @@ def assemble(
     arrays: dict[str, Any] = {}
     for view, choice in zip(views, choices, strict=True):
         camera = recording.stereo.left if view.side == "left" else recording.stereo.right
-        floor = config.model_sigma_px / float((camera or recording.stereo.right).focal)
-        arrays |= _measured(view.side, select_frames(view.detections, poses.frames), choice, floor)
+        model_sigma = config.model_sigma_px / float((camera or recording.stereo.right).focal)
+        arrays |= _measured(view.side, select_frames(view.detections, poses.frames), choice, model_sigma)
     extrinsics = recording.stereo.camera_left_T_camera_right
     return ShaftObservations(
         arm_T_rcm=poses.arm_T_rcm.cpu().numpy(),
@@ -106,12 +106,12 @@ def select_frames(detections: ShaftDetections, frames: np.ndarray) -> ShaftDetec
     return ShaftDetections(**{name: value[index] for name, value in vars(detections).items()})
 
 
-def _measured(side: str, detections: ShaftDetections, choice: Choice, floor: float) -> dict[str, np.ndarray]:
-    """The chosen candidates as arrays of DESIGN.md 6.2; `floor` is the least sigma, normalised units."""
+def _measured(side: str, detections: ShaftDetections, choice: Choice, model_sigma: float) -> dict[str, np.ndarray]:
+    """The chosen candidates as arrays of DESIGN.md 6.2; `model_sigma` is added to every sigma in quadrature, normalised units."""
     rows = torch.arange(len(choice.candidate), device=choice.candidate.device)
     best = choice.candidate.clamp_min(0)
     turned = choice.reversed
-    least = torch.tensor(floor, dtype=torch.float64, device=turned.device)
+    least = torch.tensor(model_sigma, dtype=torch.float64, device=turned.device)
 
     def pick(name: str) -> Tensor:
         value = getattr(detections, name)[rows, best]

@@ -30,7 +30,7 @@ from rmis_calib.solver.status import MotionReason
 
 GROUP_MOTIONS = 32768
 """Motions (times trials) that are solved together: a batch of trials is cut into groups whose tensors stay in the
-cache, and in which nobody waits for a trial that takes more steps. Each group has a seed of its own."""
+cache, and in which nobody waits for a trial that takes more steps."""
 
 
 def solve(
@@ -84,8 +84,7 @@ def _solve_groups(
     if flat.n_trials <= count or alone:
         return _solve_flat(flat, settings, method, kinematics, alternative)
     groups = [
-        _solve_flat(flat.take_trials(slice(b, b + count)), replace(settings, seed=settings.seed + b), method)
-        for b in range(0, flat.n_trials, count)
+        _solve_flat(flat.take_trials(slice(b, b + count)), settings, method) for b in range(0, flat.n_trials, count)
     ]
     return concatenate(groups)
 

@@ -49,14 +49,22 @@ def _turned(v: Tensor, phi: Tensor) -> Tensor:
 
 
 class _Draws:
-    """Standard normal draws of one simulation, and the same with the other sign: trials of twice as many."""
+    """Standard normal draws of one simulation, and the same with the other sign: trials of twice as many.
+
+    All trials have the same draws, and each kind of measurement has draws of its own, so that the answer of a trial
+    does not depend on the others or on what they measured.
+    """
 
     def __init__(self, measured: MeasurementRows, generator: torch.Generator) -> None:
         c, b, n = measured.cameras, measured.trials, measured.motions
+        seeds = iter(
+            torch.randint(2**62, (7 + len(measured.own),), generator=generator, device=generator.device).tolist()
+        )
 
         def draw(*shape: int) -> Tensor:
-            one = torch.randn(*shape, b, n, generator=generator, dtype=measured.p.dtype, device=measured.p.device)
-            return torch.cat((one, -one), dim=-2)
+            own = torch.Generator(device=generator.device).manual_seed(next(seeds))
+            one = torch.randn(*shape, 1, n, generator=own, dtype=measured.p.dtype, device=measured.p.device)
+            return torch.cat((one, -one), dim=-2).repeat_interleave(b, dim=-2)
 
         self.turn, self.shift = draw(3), draw(3)
         self.camera_turn, self.camera_shift = draw(3, c), draw(3, c)
@@ -127,7 +135,9 @@ def expected_score(model: WeightedModel, state: State, simulated_motions: int, s
     if wanted < n:
         picked = model.take_motions(torch.randperm(n, generator=generator, device=like.device)[:wanted])
     g, H = torch.zeros_like(model.layout.sigma), torch.zeros(b, p, p, dtype=like.dtype, device=like.device)
+    drawn = generator.get_state()
     for trials, along in picked.parts():
+        generator.set_state(drawn)
         twice = torch.arange(trials.stop - trials.start, device=like.device).repeat(2)
         at = state.take(trials).take(twice)
         for motions in along:

@@ -45,6 +45,16 @@ class Refined:
     steps: Int[Tensor, " b"]
     history: tuple[Float[Tensor, " b"], ...] = ()
 
+    def where(self, chosen: Tensor, other: "Refined") -> "Refined":
+        """This outcome in the chosen trials, `other` elsewhere."""
+        return Refined(
+            state=self.state.where(chosen, other.state),
+            normal=_where(chosen, self.normal, other.normal),
+            status=torch.where(chosen, self.status, other.status),
+            steps=torch.where(chosen, self.steps, other.steps),
+            history=self.history,
+        )
+
 
 def solve_system(
     H: Float[Tensor, "b p p"], g: Float[Tensor, "b p"], damping: Tensor | None = None

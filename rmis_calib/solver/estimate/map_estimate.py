@@ -4,7 +4,7 @@ is subtracted."""
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from rmis_calib.errors import InsufficientDataError
@@ -99,7 +99,7 @@ def map_estimate(problem: Problem, settings: SolverSettings, start: "MapEstimate
     if start is None:
         state, noise, contaminated = multistart(problem, measured, order, assumed, free, settings)
     else:
-        state, noise, contaminated = start.state, start.model.noise, bool((start.weight < REJECTED).any())
+        state, noise, contaminated = start.state, start.model.noise, (start.weight < REJECTED).any(-1).any(0)
     nominal = NuisancePriors.of(problem)
     fresh = initial_state(nominal, state.R, state.t)
     layout = make_layout(nominal, measured, fresh, settings.unknowns, settings.noise)
@@ -108,7 +108,7 @@ def map_estimate(problem: Problem, settings: SolverSettings, start: "MapEstimate
     _check_rows(measured)
     state, noise = _settle_noise(model, state, order, contaminated, assumed, free, settings)
     model = replace(model, noise=noise)
-    refined, weight = _refine_all(model, state, contaminated or settings.robust == "on", settings)
+    refined, weight = _refine_all(model, state, contaminated | (settings.robust == "on"), settings)
     return _finish(problem, replace(model, weight=weight), refined, settings)
 
 
@@ -122,38 +122,50 @@ def _settle_noise(
     model: WeightedModel,
     state: State,
     order: Tensor,
-    contaminated: bool,
+    contaminated: Bool[Tensor, " b"],
     assumed: NoiseModel,
     free: dict[str, Tensor],
     settings: SolverSettings,
 ) -> tuple[State, NoiseModel]:
-    """Outliers annealed away and noise levels estimated on a sample."""
+    """Outliers annealed away, in the contaminated trials, and noise levels estimated on a sample."""
     sample = model.take_motions(order[:SAMPLE_MOTIONS]) if model.measured.motions > SAMPLE_MOTIONS else model
-    if contaminated:
-        state, _ = anneal(sample, state, settings.outlier_probability)
+    at = torch.nonzero(contaminated)[:, 0]
+    if len(at):
+        part, _ = anneal(sample.take_trials(at), state.take(at), settings.outlier_probability)
+        state = state.put(at, part)
     for _ in range(NOISE_ROUNDS if any_free(free) else 0):
-        weight = classify(sample, state, settings.outlier_probability) if contaminated else None
+        weight = _classified(sample, state, contaminated, settings.outlier_probability)
         sample = replace(sample, weight=weight)
         sample = replace(sample, noise=estimate_components(sample, state, assumed, free, settings.noise))
         state = gauss_newton(sample, state, 0.1, 4).state
     return state, sample.noise
 
 
+def _classified(
+    model: WeightedModel, state: State, contaminated: Bool[Tensor, " b"], probability: float
+) -> Float[Tensor, "c b n"] | None:
+    """Weights of the contaminated trials; 1 in the others, and None where there are no contaminated ones."""
+    if not bool(contaminated.any()):
+        return None
+    return torch.where(contaminated[:, None], classify(model, state, probability), 1.0)
+
+
 def _refine_all(
-    model: WeightedModel, state: State, contaminated: bool, settings: SolverSettings
+    model: WeightedModel, state: State, contaminated: Bool[Tensor, " b"], settings: SolverSettings
 ) -> tuple[Refined, Float[Tensor, "c b n"] | None]:
     """Estimate from all motions, and the weights where something was rejected."""
     probability, tolerance = settings.outlier_probability, settings.tolerance_sigma
-    weight = classify(model, state, probability) if contaminated else None
+    weight = _classified(model, state, contaminated, probability)
     refined = gauss_newton(replace(model, weight=weight), state, tolerance, MAX_PASSES)
     if settings.robust == "off":
         return refined, None
     suspicious = refined.normal.distance2 if weight is None else None
     again = classify(model, refined.state, probability, suspicious)
-    changed = bool((again < REJECTED).any()) if weight is None else not torch.equal(again, weight)
-    if changed:
+    changed = (again < REJECTED if weight is None else again != weight).any(-1).any(0)
+    if bool(changed.any()):
         weight = again
-        refined = gauss_newton(replace(model, weight=weight), refined.state, tolerance, MAX_PASSES)
+        second = gauss_newton(replace(model, weight=weight), refined.state, tolerance, MAX_PASSES)
+        refined = second.where(changed, refined)
     return refined, weight
 
 

@@ -59,9 +59,9 @@ def multistart(
     assumed: NoiseModel,
     free: dict[str, Tensor],
     settings: SolverSettings,
-) -> tuple[State, NoiseModel, bool]:
-    """The best start after a short refinement on a sample, noise inflated to what it explains, and whether there are
-    outliers."""
+) -> tuple[State, NoiseModel, Bool[Tensor, " b"]]:
+    """The best start after a short refinement on a sample, noise inflated to what it explains, and which trials have
+    outliers. Every trial on its own: those that a first start settles compete no further."""
     index = order[: settings.start_motions]
     sample = measured.take_motions(index)
     starts = None if measured.has_contours else _starts(problem, measured, settings)
@@ -70,18 +70,44 @@ def multistart(
     else:
         R, t = starts[0][:, :1], starts[1][:, :1]
     first = _race(problem, sample, R, t, assumed, free, settings, robust=False)
-    if first.settled:
-        return first.state, first.noise, False
+    state, noise, contaminated = first.state, first.noise, torch.zeros_like(first.settled)
+    open_ = torch.nonzero(~first.settled)[:, 0]
+    if len(open_):
+        if starts is not None:
+            starts = starts[0][open_], starts[1][open_]
+        free_open = {name: value[open_] for name, value in free.items()}
+        part = problem.take_trials(open_), measured.take_trials(open_), order, assumed.take(open_), free_open, settings
+        best = _compete(*part, starts)
+        state, noise = state.put(open_, best.state), noise.put(open_, best.noise)
+        contaminated[open_] = best.outliers
+    return state, noise, contaminated
+
+
+def _compete(
+    problem: Problem,
+    measured: MeasurementRows,
+    order: Tensor,
+    assumed: NoiseModel,
+    free: dict[str, Tensor],
+    settings: SolverSettings,
+    starts: tuple[Tensor, Tensor] | None,
+) -> "_Multistart":
+    """All starts, and where there are outliers robust ones too; `outliers` says where these were needed."""
+    sample = measured.take_motions(order[: settings.start_motions])
     R, t = _starts(problem, measured, settings) if starts is None else starts
     race = _race(problem, sample, R, t, assumed, free, settings, robust=False)
-    state, noise = race.state, race.noise
     # A poor fit hides outliers where the noise levels are to be estimated: they are raised until it looks good.
-    suspect = race.outliers or settings.robust == "on" or (any_free(free) and not race.settled)
-    if settings.robust == "off" or not suspect:
-        return state, noise, False
+    suspect = race.outliers | (settings.robust == "on") | (_any_free_by_trial(free) & ~race.settled)
+    at = torch.nonzero(suspect & (settings.robust != "off"))[:, 0]
+    race = replace(race, outliers=torch.zeros_like(suspect))
+    if not len(at):
+        return race
     index = order[: ROBUST_SAMPLES * settings.start_motions]
+    problem, measured = problem.take_trials(at), measured.take_trials(at)
+    assumed, free = assumed.take(at), {name: value[at] for name, value in free.items()}
     sample = measured.take_motions(index)
     candidates = robust_candidates(problem.select_motions(index), settings.grid, COMPETING_MINIMA)
+    state = race.state.take(at)
     starts_R, starts_t = [state.R[:, None], candidates.R], [state.t[:, None], candidates.t]
     if measured.has_contours:
         R, t = contour_starts(sample, torch.nan_to_num(problem.radius_mm), reweightings=10)
@@ -89,19 +115,22 @@ def multistart(
     if _points_matter(measured):
         R, t = point_starts(sample, settings.grid, COMPETING_MINIMA, reweightings=4)
         starts_R, starts_t = [*starts_R, R], [*starts_t, t]
-    race = _race(problem, sample, torch.cat(starts_R, 1), torch.cat(starts_t, 1), assumed, free, settings, robust=True)
-    return race.state, race.noise, True
+    robust = _race(
+        problem, sample, torch.cat(starts_R, 1), torch.cat(starts_t, 1), assumed, free, settings, robust=True
+    )
+    contaminated = torch.zeros_like(suspect)
+    contaminated[at] = True
+    return _Multistart(race.state.put(at, robust.state), race.noise.put(at, robust.noise), contaminated, race.settled)
 
 
 @dataclass(frozen=True)
 class _Multistart:
-    """Winner of a race of starts: state and noise levels per trial; whether any trial has outliers; whether no other
-    start needs to be tried."""
+    """Winner of a race of starts, and its noise levels; which trials have outliers, and which need no other start."""
 
     state: State
     noise: NoiseModel
-    outliers: bool
-    settled: bool
+    outliers: Bool[Tensor, " b"]
+    settled: Bool[Tensor, " b"]
 
 
 def _starts(
@@ -168,11 +197,10 @@ def _race(
     front, sure = (torch.cat([part[i] for part in kept]) for i in (2, 3))
     noise = _inflated(assumed, free, distance2, rows)
     limit = chi2_quantile(rows, settings.outlier_probability)
-    if any_free(free):
-        limit = limit * _inflation(distance2, rows)[:, None]
-    outliers = bool(((distance2 > 2.0 * limit) & (rows > 0)).any())
+    limit = limit * torch.where(_any_free_by_trial(free), _inflation(distance2, rows), 1.0)[:, None]
+    outliers = ((distance2 > 2.0 * limit) & (rows > 0)).any(-1).any(0)
     fits = distance2.sum((0, 2)) < SETTLED_FIT * rows.sum((0, 2))
-    return _Multistart(state, noise, outliers, bool((fits & (front > 0.9) & sure).all()) and not outliers)
+    return _Multistart(state, noise, outliers, fits & (front > 0.9) & sure & ~outliers)
 
 
 def _sure(H: Float[Tensor, "b p p"]) -> Bool[Tensor, " b"]:
@@ -199,4 +227,8 @@ def _inflated(assumed: NoiseModel, free: dict[str, Tensor], distance2: Tensor, r
 
 def any_free(free: dict[str, Tensor]) -> bool:
     """Whether any noise level of any trial is to be estimated."""
-    return any(bool(value.any()) for value in free.values())
+    return bool(_any_free_by_trial(free).any())
+
+
+def _any_free_by_trial(free: dict[str, Tensor]) -> Bool[Tensor, " b"]:
+    return torch.stack(list(free.values())).any(0)

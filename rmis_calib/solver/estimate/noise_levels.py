@@ -83,6 +83,7 @@ def estimate_components(
     parts = _component_matrices(measured, linear)
     free_mask = free_components(measured, free)
     centre, prior = log_prior(assumed, settings)
+    active = free_mask.any(-1, keepdim=True)
     for _ in range(SCORING_STEPS):
         theta = torch.stack([getattr(noise, name) for name in COMPONENTS], dim=-1).clamp_min(1e-30).log()
         score, fisher = _score(measured, linear, J, r, noise, parts, layout)
@@ -96,9 +97,10 @@ def estimate_components(
         step = torch.linalg.solve(fisher, torch.where(fixed, 0.0, score)[..., None])[..., 0].clamp(
             -MAX_LOG_STEP, MAX_LOG_STEP
         )
-        moved = torch.where(fixed, v, (theta + step).exp())
+        moved = torch.where(fixed | ~active, v, (theta + step).exp())
         noise = replace(noise, **{name: moved[:, i] for i, name in enumerate(COMPONENTS)})
-        if not bool((torch.where(fixed, 0.0, step).abs() > SETTLED).any()):
+        active = active & (torch.where(fixed, 0.0, step).abs() > SETTLED).any(-1, keepdim=True)
+        if not bool(active.any()):
             break
     return noise
 

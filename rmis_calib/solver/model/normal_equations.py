@@ -37,6 +37,12 @@ class NoiseModel:
     def take(self, index: Tensor | slice) -> "NoiseModel":
         return NoiseModel(**{name: value[index] for name, value in vars(self).items()})
 
+    def put(self, index: Tensor, part: "NoiseModel") -> "NoiseModel":
+        """These levels with those of the trials `index` replaced."""
+        return NoiseModel(
+            **{name: value.index_copy(0, index, getattr(part, name)) for name, value in vars(self).items()}
+        )
+
     def repeat(self, times: int) -> "NoiseModel":
         return NoiseModel(**{name: value.repeat_interleave(times) for name, value in vars(self).items()})
 

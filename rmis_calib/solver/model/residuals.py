@@ -95,6 +95,12 @@ class State:
 
         return State(**{f.name: pick(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)})
 
+    def put(self, index: Tensor, part: "State") -> "State":
+        """This state with that of the trials `index` replaced."""
+        return State(
+            **{f.name: getattr(self, f.name).index_copy(0, index, getattr(part, f.name)) for f in fields(self)}
+        )
+
     def take(self, index: Tensor | slice) -> "State":
         """The state of the trials `index`."""
         return State(**{f.name: getattr(self, f.name)[index] for f in fields(self)})

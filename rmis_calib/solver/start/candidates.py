@@ -204,11 +204,12 @@ def contour_starts(
     axes = seen_axes(measured, radius)
     v = measured.v[:, None].expand_as(axes.direction)
     arm_end = (measured.p + measured.s_end * measured.v)[:, None].expand_as(v)
+    enough = axes.end_weight.sum((0, 2)) >= 3
     kinds: list[float | None] = [None]
-    if bool((axes.end_weight.sum((0, 2)) >= 3).all()):
+    if bool(enough.any()):
         kinds += [0.0, DIRECTION_LENGTH_MM**2]
     if not all_kinds:
-        kinds = kinds[-1:]
+        kinds = kinds[-1:] if bool(enough.all()) else [None, *kinds[1:][-1:]]
     starts = []
     for mix in kinds:
         weight = axes.weight if mix is None else axes.end_weight
@@ -222,7 +223,11 @@ def contour_starts(
                 R, t = _absolute_orientation(axes.end, arm_end, weight, mix * correlation)
                 error = _length(axes.end - _turn(R, arm_end) - t.T[:, None, :, None])
             weight = (axes.weight if mix is None else axes.end_weight) / error.clamp_min(1.0)
+        if mix is not None and starts:  # trials with too few ends start from contours alone
+            R, t = torch.where(enough[:, None, None], R, starts[0][0]), torch.where(enough[:, None], t, starts[0][1])
         starts.append((R, t))
+    if not all_kinds:
+        starts = starts[-1:]
     return torch.stack([s[0] for s in starts], dim=1), torch.stack([s[1] for s in starts], dim=1)
 
 

@@ -130,18 +130,20 @@ def descend(gram: Float[Tensor, "b 9 9"], R: Float[Tensor, "b g 3 3"], steps: in
     """Every rotation moved to its local minimum: (rotations, costs). A step that raises the cost is not taken."""
     cost, gradient, hessian, gauss_newton = derivatives(gram, R)
     scale = torch.ones_like(cost)
+    active = torch.ones_like(cost[:, :1], dtype=torch.bool)  # by trial: what becomes of one is not for others to decide
     for _ in range(steps):
         proposal = rotvec_to_matrix(scale[..., None] * newton_step(gradient, hessian, gauss_newton)) @ R
         new_cost, new_gradient, new_hessian, new_gauss_newton = derivatives(gram, proposal)
-        better = new_cost <= cost
-        if not bool((cost - new_cost > SETTLED * cost).any()):
-            return torch.where(better[..., None, None], proposal, R), torch.where(better, new_cost, cost)
+        better = (new_cost <= cost) & active
+        active = active & (cost - new_cost > SETTLED * cost).any(-1, keepdim=True)
         R = torch.where(better[..., None, None], proposal, R)
         cost = torch.where(better, new_cost, cost)
         gradient = torch.where(better[..., None], new_gradient, gradient)
         hessian = torch.where(better[..., None, None], new_hessian, hessian)
         gauss_newton = torch.where(better[..., None, None], new_gauss_newton, gauss_newton)
         scale = torch.where(better, 1.0, 0.25 * scale)
+        if not bool(active.any()):
+            break
     return R, cost
 
 
