@@ -107,7 +107,8 @@ def select_frames(detections: ShaftDetections, frames: np.ndarray) -> ShaftDetec
 
 
 def _measured(side: str, detections: ShaftDetections, choice: Choice, model_sigma: float) -> dict[str, np.ndarray]:
-    """The chosen candidates as arrays of DESIGN.md 6.2; `model_sigma` is added to every sigma in quadrature, normalised units."""
+    """The chosen candidates as arrays of DESIGN.md 6.2; `model_sigma`, in normalised units, is added to every sigma in
+    quadrature."""
     rows = torch.arange(len(choice.candidate), device=choice.candidate.device)
     best = choice.candidate.clamp_min(0)
     turned = choice.reversed

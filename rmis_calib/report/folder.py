@@ -11,7 +11,7 @@ from rmis_calib.pipeline.detection import DetectionTable, View
 from rmis_calib.pipeline.run import CalibrationRun
 from rmis_calib.report.detection_pictures import write_picture
 from rmis_calib.report.page import write_report
-from rmis_calib.report.pictures import overlays
+from rmis_calib.report.pictures import overlays, spread
 from rmis_calib.results import finite_or_none
 from rmis_calib.vision import FrameReason
 
@@ -39,14 +39,19 @@ def write_calibration_folder(folder: Path, run: CalibrationRun, count: int) -> N
         run.observations.save(folder / "observations.npz")
     pictures = folder / "overlays"
     pictures.mkdir()
-    for overlay in overlays(run, count):
-        write_picture(pictures / f"{overlay.camera}_{overlay.frame:06d}.jpg", overlay.image)
-    per_view = max(1, REPORT_PICTURES // len(run.views))
+    motions = len(run.poses.frames)
+    written, shown = spread(motions, count), spread(motions, max(1, REPORT_PICTURES // len(run.views)))
+    in_page = []
+    for overlay in overlays(run, np.union1d(written, shown)):
+        if overlay.frame in run.poses.frames[written]:
+            write_picture(pictures / f"{overlay.camera}_{overlay.frame:06d}.jpg", overlay.image)
+        if overlay.frame in run.poses.frames[shown]:
+            in_page.append(overlay)
     name = run.recording.path.resolve().name
     write_report(
         folder / "report.html",
         run.result,
-        tuple(overlays(run, per_view)),
+        tuple(in_page),
         title=f"Hand-eye calibration: {name}",
         source=name,
     )

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from rmis_calib.geometry.cameras import Camera
@@ -15,15 +15,20 @@ from rmis_calib.results import CalibrationResult
 from rmis_calib.vision import draw_dot, draw_polyline
 
 _SAMPLES = 200
+_AT_ONCE = 16
+"""Frames read in one call: opening and seeking a video for each takes longer than drawing, and all may not fit."""
 
 
-def overlays(run: CalibrationRun, count: int) -> Iterator[Overlay]:
-    """Pictures spread over the motions of each view, rejected ones among them; -1 for all."""
+def overlays(run: CalibrationRun, motions: np.ndarray) -> Iterator[Overlay]:
+    """Pictures of these motions (increasing numbers) in each view; each video is read once, a few frames at a time."""
     for view in run.views:
         contours, ends = run.predicted_contours(view), run.predicted_ends(view)
-        for motion in spread(len(run.poses.frames), count):
-            contour_n = None if contours is None else contours[motion]
-            yield _overlay(run, view, int(motion), contour_n, None if ends is None else ends[motion])
+        for start in range(0, len(motions), _AT_ONCE):
+            part = motions[start : start + _AT_ONCE].tolist()
+            images = view.source.frames(run.poses.frames[part].tolist())
+            for motion, image in zip(part, images, strict=True):
+                contour_n = None if contours is None else contours[motion]
+                yield _overlay(run, view, motion, image, contour_n, None if ends is None else ends[motion])
 
 
 def spread(total: int, count: int) -> np.ndarray:
@@ -34,11 +39,16 @@ def spread(total: int, count: int) -> np.ndarray:
 
 
 def _overlay(
-    run: CalibrationRun, view: View, motion: int, contour_n: Tensor | None, camera_p_end: Tensor | None
+    run: CalibrationRun,
+    view: View,
+    motion: int,
+    image: UInt8[Tensor, "3 h w"],
+    contour_n: Float[Tensor, "2 3"] | None,
+    camera_p_end: Float[Tensor, " 3"] | None,
 ) -> Overlay:
-    """One frame; `contour_n` (2, 3) and `camera_p_end` (3,) are what the result predicts for it."""
+    """One frame; `contour_n` and `camera_p_end` are what the result predicts for it."""
     frame = int(run.poses.frames[motion])
-    canvas = np.ascontiguousarray(view.source.frame(frame).permute(1, 2, 0).cpu().numpy())
+    canvas = np.ascontiguousarray(image.permute(1, 2, 0).numpy())
     thickness = max(1, round(canvas.shape[1] / 360))
     choice = run.choices[run.views.index(view)]
     candidate = int(choice.candidate[motion])

@@ -26,13 +26,15 @@ QUATERNION_TOLERANCE = 1e-7
 """rad. Steps shrink quadratically near the minimum, so what is left after such a step is far smaller still."""
 
 
-def linear_rotation(gram: Float[Tensor, "b 9 9"]) -> Float[Tensor, "b 3 3"]:
+def linear_rotation(vectors: Float[Tensor, "b 9 9"]) -> Float[Tensor, "b 3 3"]:
     """Eqs. 10 to 13: smallest right singular vector, scaled by sign(det)/|det|^(1/3), then projected to SO(3).
+
+    Args:
+        vectors: eigenvectors of the Gram matrix as columns, that of the smallest eigenvalue first.
 
     The smallest eigenvector of the Gram matrix is the smallest right singular vector of the stacked rows. The published
     scaling makes the determinant 1 but leaves the matrix short of orthogonal, hence the projection.
     """
-    _, vectors = torch.linalg.eigh(gram)
     V = unvec(vectors[..., 0])
     det = torch.linalg.det(V)
     scaled = (
@@ -43,12 +45,18 @@ def linear_rotation(gram: Float[Tensor, "b 9 9"]) -> Float[Tensor, "b 3 3"]:
     return project_to_so3(scaled)
 
 
-def refine_quaternion(gram: Float[Tensor, "b 9 9"], R: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 3 3"]:
+def refine_quaternion(
+    values: Float[Tensor, "b 9"], vectors: Float[Tensor, "b 9 9"], R: Float[Tensor, "b 3 3"]
+) -> Float[Tensor, "b 3 3"]:
     """Eqs. 14 to 17: minimise sum (n.R(q) v)^2 over the unit quaternion.
 
     With the Gram matrix as F^T F the sum is |F vec(R)|^2: nine residuals, whatever the number of motions.
+
+    Args:
+        values: eigenvalues of the Gram matrix.
+        vectors: its eigenvectors as columns.
+        R: where to start.
     """
-    values, vectors = torch.linalg.eigh(gram)
     factor = values.clamp_min(0.0).sqrt()[..., None] * vectors.mT
 
     def residual(q: Float[Tensor, "*k b 4"], _: Tensor) -> Float[Tensor, "*k b 9"]:
@@ -70,7 +78,8 @@ def solve_paper(statistics: LineStatistics) -> tuple[Float[Tensor, "b c 3 3"], F
     """The estimate of each camera on its own (`camera_right_T_arm` both times)."""
     gram = statistics.rotation_gram.flatten(0, 1)
     with torch.no_grad():
-        R = refine_quaternion(gram, linear_rotation(gram))
+        values, vectors = torch.linalg.eigh(gram)
+        R = refine_quaternion(values, vectors, linear_rotation(vectors))
     R = (on_graph(gram, R) if gram.requires_grad else R).unflatten(0, statistics.rotation_gram.shape[:2])
     t, _ = solve_translation(statistics.apart(), R.flatten(0, 1)[:, None])
     return R, t[:, 0].unflatten(0, R.shape[:2])

@@ -115,7 +115,7 @@ def test_the_translation_of_the_paper_is_the_refined_one(simulate, realistic):
     problem, _, _ = simulate(**realistic)
     problem = problem.only("axis").cameras(1)
     statistics = LineStatistics.from_problem(problem)
-    R = linear_rotation(statistics.rotation_gram.sum(1))
+    R = linear_rotation(torch.linalg.eigh(statistics.rotation_gram.sum(1)).eigenvectors)
     expected, _ = solve_translation(statistics, R[:, None])
     n, _, ok = plane_normals(problem)
     n = torch.where(ok[..., None], n, 0.0)
