@@ -1,9 +1,14 @@
-"""What may stand in recording.yaml, stereo.yaml and robot.yaml (DESIGN.md 6.1): every key, its type and its range."""
+"""What may stand in recording.yaml, stereo.yaml and robot.yaml (DESIGN.md 6.1): every key, its type and its range.
+
+What the keys of robot.yaml mean is said in `rmis_calib.robot`.
+"""
 
 import math
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, model_validator
+
+from rmis_calib.robot import DhConvention, JointType
 
 METRES = "looks like metres; write millimetres"
 DEGREES = "looks like degrees; write radians"
@@ -113,7 +118,7 @@ class StereoSchema(Schema):
 
 class JointSchema(Schema):
     name: Name
-    type: Literal["revolute", "prismatic"]
+    type: JointType
     alpha_rad: Angle
     a_mm: float
     theta_rad: Angle
@@ -179,5 +184,5 @@ class ArmSchema(Schema):
 
 class RobotSchema(Schema):
     name: Annotated[str, StringConstraints(min_length=1)]
-    dh_convention: Literal["modified", "standard"]
+    dh_convention: DhConvention
     arms: Annotated[dict[Name, ArmSchema], Field(min_length=1)]

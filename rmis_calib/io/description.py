@@ -17,10 +17,11 @@ from rmis_calib.io.configs import load_yaml
 from rmis_calib.io.folders import DESCRIPTION, recording_folder
 from rmis_calib.io.joints import JointLog, load_joints
 from rmis_calib.io.readers import Reader, open_reader
-from rmis_calib.io.robot import Robot, load_robot
+from rmis_calib.io.robot import load_robot
 from rmis_calib.io.stereo import Intrinsics, StereoFile, read_stereo
 from rmis_calib.io.tables import HeadPoints, read_frame_times, read_head_points
 from rmis_calib.io.validation import validate
+from rmis_calib.robot import Robot
 
 # Images of a stereo pair that are further apart than this part of a frame interval do not show one instant.
 _STEREO_SLACK = 0.5

@@ -11,7 +11,7 @@ from rmis_calib.errors import RecordingError
 from rmis_calib.io._checks import Note, no_note
 from rmis_calib.io._csv import Table, read_table, require_columns, require_increasing
 from rmis_calib.io._schemas import DEGREES, FULL_TURN_RAD, METRES
-from rmis_calib.io.robot import Joint, Robot
+from rmis_calib.robot import Joint, Robot
 
 # A frame this close to a sample takes it as it is: timestamps printed with four decimals count as equal, and a tool at
 # 100 mm/s moves 0.01 mm in it.
@@ -157,14 +157,12 @@ def load_joints(path: str | Path, robot: Robot, arms: tuple[str, ...], note: Not
             the joint's range; time does not increase. Names line and column.
     """
     table = _in_our_units(read_table(path, note=note), note)
-    columns = tuple(column for arm in arms for column in robot.columns(arm))
+    joints = robot.joints(*arms)
+    columns = tuple(joints)
     _check_units(table, columns)
     _check_unused_arms(table, robot, arms)
     require_columns(table, (_TIME, *columns))
     stamps = require_increasing(table, _TIME)
-    joints = {
-        column: joint for arm in arms for column, joint in zip(robot.columns(arm), robot.arms[arm].joints, strict=True)
-    }
     is_continuous = len(stamps) > 2 and float(np.median(np.diff(stamps))) <= _CONTINUOUS_S
     spikes = np.zeros(len(stamps), dtype=bool)
     index = [table.columns.index(column) for column in columns]

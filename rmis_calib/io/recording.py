@@ -11,10 +11,10 @@ from rmis_calib.geometry.cameras import Camera, StereoRig
 from rmis_calib.geometry.rigid import RigidTransform
 from rmis_calib.io.description import RecordingDescription, read_description
 from rmis_calib.io.joints import JointLog
-from rmis_calib.io.robot import Robot
 from rmis_calib.io.stereo import Intrinsics, StereoFile
 from rmis_calib.io.tables import HeadPoints
 from rmis_calib.io.video import FrameSource
+from rmis_calib.robot import Robot
 
 
 @dataclass(frozen=True, eq=False)

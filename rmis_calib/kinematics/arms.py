@@ -1,18 +1,16 @@
 """Joint readings of both arms to the transforms that the calibration needs."""
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from rmis_calib.errors import RobotError, ShapeError
 from rmis_calib.geometry.rigid import rigid_inverse, transform_points
-from rmis_calib.kinematics.dh import JointRow, build_chain, frame_poses
+from rmis_calib.kinematics.dh import build_chain, frame_poses
+from rmis_calib.robot import Arm, Robot
 
 # A shaft that misses its remote centre by more than this has the wrong frame number or the wrong table: real tables
 # miss it by micrometres, and a wrong frame by centimetres.
@@ -21,46 +19,6 @@ _LEAST_SPREAD = 0.01
 """Mean squared sine of the axes' directions from which lines meet in a point, not in a bundle of parallels."""
 _PIVOT_SAMPLES, _PIVOT_MISS_MM = 32, 5.0
 """Poses of the laparoscope's arm from which its remote centre is told, and how far its axis may pass from it."""
-
-
-@runtime_checkable
-class HeadPointTable(Protocol):
-    """A point of the instrument's head that can be seen, fixed in one of its frames."""
-
-    @property
-    def frame(self) -> int: ...
-    @property
-    def xyz_mm(self) -> Sequence[float]: ...
-
-
-@runtime_checkable
-class ArmTable(Protocol):
-    """One arm of a robot description; what only one of the two arms has is None for the other."""
-
-    @property
-    def base_T_arm_base(self) -> np.ndarray: ...
-    @property
-    def joints(self) -> Sequence[JointRow]: ...
-    @property
-    def end_T_tool(self) -> np.ndarray | None: ...
-    @property
-    def rcm_frame(self) -> int | None: ...
-    @property
-    def shaft_frame(self) -> int | None: ...
-    @property
-    def head_point(self) -> HeadPointTable | None: ...
-
-
-@runtime_checkable
-class RobotTable(Protocol):
-    """A robot description, as `io.load_robot` reads it."""
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def dh_convention(self) -> str: ...
-    @property
-    def arms(self) -> Mapping[str, ArmTable]: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +52,7 @@ class RobotKinematics:
 
     def __init__(
         self,
-        robot: RobotTable,
+        robot: Robot,
         laparoscope_arm: str | None,
         instrument_arm: str,
         dtype: torch.dtype = torch.float64,
@@ -186,17 +144,17 @@ class RobotKinematics:
 class _Arm:
     """Chain of one arm with its constants as tensors."""
 
-    def __init__(self, robot: RobotTable, name: str, dtype: torch.dtype, device: torch.device | str) -> None:
+    def __init__(self, robot: Robot, name: str, dtype: torch.dtype, device: torch.device | str) -> None:
         if name not in robot.arms:
             raise RobotError(where=f"robot {robot.name}", expected=f"an arm {name!r}", found=", ".join(robot.arms))
         table = robot.arms[name]
 
         def constant(value: object) -> Tensor:
-            return torch.as_tensor(np.asarray(value), dtype=dtype, device=device)
+            return torch.as_tensor(value, dtype=dtype, device=device)
 
         self.names = tuple(row.name for row in table.joints)
         self._rows = table.joints
-        self.end_T_tool = constant(np.eye(4) if table.end_T_tool is None else table.end_T_tool)
+        self.end_T_tool = constant(table.end_T_tool)
         self._base_T_arm_base = constant(table.base_T_arm_base)
         self._offsets = constant([float(row.offset) for row in table.joints])
         self._chain = build_chain(table.joints, robot.dh_convention, dtype, device)
@@ -214,7 +172,7 @@ class _Arm:
         part = torch.linspace(0.1, 0.9, count, dtype=self._offsets.dtype, device=self._offsets.device)
         columns = []
         for i, row in enumerate(self._rows):
-            low, high = getattr(row, "min", None), getattr(row, "max", None)
+            low, high = row.min, row.max
             if low is None or high is None:
                 low, high = (-0.5, 0.5) if row.type == "revolute" else (50.0 - row.offset, 150.0 - row.offset)
             # Each joint at its own rhythm: a straight line through joint space would leave the axes in one plane.
@@ -239,8 +197,8 @@ def _common_point(p: Float[Tensor, "n 3"], d: Float[Tensor, "n 3"]) -> tuple[Flo
     return x, float((across @ (x - p)[..., None])[..., 0].norm(dim=-1).max())
 
 
-def _frame_number(number: int | None, table: ArmTable, where: str) -> int:
-    count = len(table.joints)
+def _frame_number(number: int | None, arm: Arm, where: str) -> int:
+    count = len(arm.joints)
     if number is None or not 0 <= number <= count:
         raise RobotError(where=where, expected=f"a frame number, 0 (the arm's base) to {count}", found=number)
     return number

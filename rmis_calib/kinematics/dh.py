@@ -1,36 +1,17 @@
 """Denavit-Hartenberg tables as pytorch-kinematics chains."""
 
 from collections.abc import Sequence
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from pytorch_kinematics.chain import Chain
-from pytorch_kinematics.frame import Frame, Joint, Link
+from pytorch_kinematics.frame import Frame, Link
+from pytorch_kinematics.frame import Joint as ChainJoint
 from pytorch_kinematics.transforms import Transform3d
 from torch import Tensor
 
 from rmis_calib.errors import RobotError, ShapeError
-
-
-@runtime_checkable
-class JointRow(Protocol):
-    """One row of a table. Lengths in mm, angles in rad; `offset` in the joint's own unit, added to its reading."""
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def type(self) -> str: ...
-    @property
-    def alpha_rad(self) -> float: ...
-    @property
-    def a_mm(self) -> float: ...
-    @property
-    def theta_rad(self) -> float: ...
-    @property
-    def d_mm(self) -> float: ...
-    @property
-    def offset(self) -> float: ...
+from rmis_calib.robot import Joint
 
 
 def dh_matrix(
@@ -66,7 +47,7 @@ def dh_matrix(
 
 
 def build_chain(
-    joints: Sequence[JointRow], convention: str, dtype: torch.dtype, device: torch.device | str = "cpu"
+    joints: Sequence[Joint], convention: str, dtype: torch.dtype, device: torch.device | str = "cpu"
 ) -> Chain:
     """Serial chain whose frames `frame_0` (the arm's base) to `frame_J` are those of the table.
 
@@ -90,7 +71,7 @@ def build_chain(
         row = torch.tensor([alpha, a, theta, d], dtype=torch.float64)
         return Transform3d(matrix=dh_matrix(row[0], row[1], row[2], row[3], convention).to(dtype))
 
-    root = end = Frame("frame_0", link=Link("frame_0"), joint=Joint(dtype=dtype))
+    root = end = Frame("frame_0", link=Link("frame_0"), joint=ChainJoint(dtype=dtype))
     for number, row in enumerate(joints, start=1):
         if row.type not in ("revolute", "prismatic"):
             expected = "type revolute or prismatic"
@@ -98,11 +79,11 @@ def build_chain(
         modified = convention == "modified"
         before = (row.alpha_rad, row.a_mm) if modified else (0.0, 0.0)
         offset = fixed(*before, row.theta_rad, row.d_mm)
-        joint = Joint(f"{number}.{row.name}", offset, row.type, dtype=dtype)
+        joint = ChainJoint(f"{number}.{row.name}", offset, row.type, dtype=dtype)
         end = _append(end, f"frame_{number}" if modified else f"joint_{number}", joint)
         if not modified:
             after = fixed(row.alpha_rad, row.a_mm, 0.0, 0.0)
-            end = _append(end, f"frame_{number}", Joint(f"{number}.link", after, "fixed", dtype=dtype))
+            end = _append(end, f"frame_{number}", ChainJoint(f"{number}.link", after, "fixed", dtype=dtype))
     # Moved at the end: a chain that is made on another device keeps some of its index tensors on the CPU.
     return Chain(root, dtype=dtype).to(device=device)
 
@@ -125,7 +106,7 @@ def frame_poses(chain: Chain, joints: Float[Tensor, "*batch j"]) -> Float[Tensor
     return poses[frames].movedim(0, 1).reshape(*joints.shape[:-1], len(frames), 4, 4)
 
 
-def _append(parent: Frame, name: str, joint: Joint) -> Frame:
+def _append(parent: Frame, name: str, joint: ChainJoint) -> Frame:
     child = Frame(name, link=Link(name), joint=joint)
     parent.add_child(child)
     return child

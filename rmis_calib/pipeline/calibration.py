@@ -31,7 +31,6 @@ from rmis_calib.pipeline.evaluation import head_point_errors, summarise_head_poi
 from rmis_calib.pipeline.frozen import about_repeats, repeated_motions, without_frames
 from rmis_calib.pipeline.kinematic_unknowns import (
     KinematicUnknowns,
-    estimated_offsets,
     poses_at,
     with_rcm_offset,
 )
@@ -44,6 +43,7 @@ from rmis_calib.pipeline.next_motion import (
     may_advise,
 )
 from rmis_calib.pipeline.observing import assemble, reasons_for, select_frames
+from rmis_calib.pipeline.offset_unknowns import estimated_offsets
 from rmis_calib.pipeline.poses import MotionPoses, motion_poses
 from rmis_calib.pipeline.run import CalibrationRun
 from rmis_calib.pipeline.starting import first_choices, read_prior

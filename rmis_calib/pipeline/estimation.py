@@ -15,10 +15,11 @@ from rmis_calib.geometry.rigid import RigidTransform
 from rmis_calib.io import ShaftObservations
 from rmis_calib.pipeline.device import require_device
 from rmis_calib.pipeline.file_unknowns import FileUnknowns, file_unknowns
-from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns, estimated_offsets
 from rmis_calib.pipeline.next_motion import advice_record, may_advise, seen_view
 from rmis_calib.pipeline.next_pose import WHERE, pose_candidates
+from rmis_calib.pipeline.offset_unknowns import OffsetUnknowns, estimated_offsets
 from rmis_calib.results import JOINT_OFFSET, STATUS_SENTENCES, CalibrationResult, Motions, Status
+from rmis_calib.robot import split_joint_column
 from rmis_calib.solver import Problem, Solution, SolveStatus
 from rmis_calib.solver import solve as solve_problem
 from rmis_calib.solver.estimate.relinearise import scan_clock
@@ -104,8 +105,7 @@ def solve(
     if unknowns is None:
         solution, notes = estimate(observations, config, measurements), ()
     else:
-        at = unknowns.clock_at_s
-        solution, notes = estimate_with_kinematics(observations, config, unknowns, at, measurements)
+        solution, notes = estimate_with_kinematics(observations, config, unknowns, measurements=measurements)
     motions = Motions(*used_motions(solution))
     residuals, columns = residuals_normalised(solution, motions.used), () if unknowns is None else unknowns.columns
     for item in measurements:
@@ -150,7 +150,7 @@ def estimate(
 def estimate_with_kinematics(
     observations: ShaftObservations,
     config: CalibrationConfig,
-    unknowns: KinematicUnknowns | FileUnknowns,
+    unknowns: OffsetUnknowns,
     clock_s: float | None = None,
     measurements: Sequence[Measurement] = (),
 ) -> tuple[Solution, tuple[str, ...]]:
@@ -165,7 +165,7 @@ def estimate_with_kinematics(
         observations: N motions.
         config: method, measurements to use, noise, unknowns.
         unknowns: the kinematics as a function of the offsets.
-        clock_s: clock offset found before, to start from; None: it is searched for.
+        clock_s: clock offset found before, to start from; None: that of the unknowns, else it is searched for.
         measurements: of the user's own.
     """
     base = problem_of(observations, config).with_own(measurements).flatten_batch()
@@ -174,8 +174,10 @@ def estimate_with_kinematics(
     if asked.joint_offsets == "never":
         sigma = sigma * 0.0
     if clock_s is None:
+        clock_s = unknowns.clock_at_s
+    if clock_s is None:
         clock_s = 0.0
-        if asked.clock and isinstance(unknowns, KinematicUnknowns) and unknowns.has_clock:
+        if asked.clock and unknowns.has_clock:
             # Whatever is measured: the axis lines tell the clock even where the answer does not use them.
             lines = Problem.from_observations(observations, device=config.device).only("axis").flatten_batch()
             clock_s = _clock_start(lines, unknowns, config.clock_search_s, sigma)
@@ -231,7 +233,7 @@ def _about_offsets(
         columns: name of each joint, with its unit.
         probability: that there are offsets at all.
     """
-    names = [column.rpartition("_")[0] for column in columns]
+    names = [split_joint_column(column)[0] for column in columns]
     sigmas, held, shares = offsets.sigma.tolist(), offsets.held.tolist(), unseen.diagonal().tolist()
     joints = zip(names, columns, sigmas, held, shares, moves.tolist(), strict=True)
     visible = [joint for *joint, moved in joints if moved]
@@ -249,10 +251,10 @@ def _about_offsets(
 
 
 def _shown(sigma: float, column: str) -> str:
-    return f"{np.rad2deg(sigma):.2g} deg" if column.endswith("_rad") else f"{sigma:.2g} mm"
+    return f"{np.rad2deg(sigma):.2g} deg" if split_joint_column(column)[1] == "rad" else f"{sigma:.2g} mm"
 
 
-def _clock_start(base: Problem, unknowns: KinematicUnknowns, reach_s: float, like: torch.Tensor) -> float:
+def _clock_start(base: Problem, unknowns: OffsetUnknowns, reach_s: float, like: torch.Tensor) -> float:
     """Clock offset at which axis lines and joints agree best; 0 unless another one is clearly better."""
 
     def scan(centre_s: float, half_s: float, step_s: float) -> tuple[float, torch.Tensor]:
@@ -410,7 +412,8 @@ def _nuisance_records(solution: Solution, joint_columns: tuple[str, ...]) -> dic
             key = name if len(values) == 1 else f"{name}[{index}]"
             unit = nuisance.unit
             if name == "joint_offset":
-                key, _, unit = f"{JOINT_OFFSET}{joint_columns[index]}".rpartition("_")
+                joint, unit = split_joint_column(joint_columns[index])
+                key = f"{JOINT_OFFSET}{joint}"
             records[key] = {"value": value, "sigma": sigma, "unit": unit, "held": is_held}
     for name, level in solution.noise.items():
         records[f"noise {name}"] = {"value": float(level), "sigma": None, "unit": _noise_unit(name)}

@@ -15,16 +15,13 @@ from rmis_calib.errors import ObservationsError
 from rmis_calib.geometry.rigid import rigid_exp
 from rmis_calib.io import ShaftObservations
 from rmis_calib.io.observations import CLOCK
-from rmis_calib.pipeline.kinematic_unknowns import joint_sigma
+from rmis_calib.pipeline.offset_unknowns import OffsetUnknowns
 from rmis_calib.solver import Problem
-from rmis_calib.solver.settings import SolverSettings, UnknownSettings
-
-_MOVES = {"rad": 1e-4, "mm": 1e-6}
-"""Displacement a unit below which a joint does not move the shaft."""
+from rmis_calib.solver.settings import SolverSettings
 
 
-class FileUnknowns:
-    """Poses of the motions at joint offsets and a clock offset, to first order, with their derivatives."""
+class FileUnknowns(OffsetUnknowns):
+    """The effect of the offsets as an observations file tells it: the same derivatives at every set of offsets."""
 
     def __init__(self, observations: ShaftObservations, device: str) -> None:
         """Keep the displacements.
@@ -40,31 +37,15 @@ class FileUnknowns:
         effect = torch.as_tensor(observations.unknown_displacement, device=device).nan_to_num(nan=0.0).mT  # (m, 6, u)
         at = torch.as_tensor(observations.unknown_at, device=device)
         self.columns = tuple(names[index] for index in joints)
-        """`<arm>.<joint>_rad` or `_mm`, as in the file."""
         self.has_clock = CLOCK in names
-        """Whether the file tells the effect of a clock offset."""
-        self.clock_at_s = float(at[names.index(CLOCK)]) if self.has_clock else 0.0
-        """Clock offset at which the file's kinematics were evaluated."""
         self._joint, self._joint_at = effect[..., joints], at[joints]
+        self.clock_at_s = self._clock_at_s = float(at[names.index(CLOCK)]) if self.has_clock else 0.0
         self._clock = effect[..., names.index(CLOCK)] if self.has_clock else torch.zeros_like(effect[..., 0])
 
-    def prior_sigma(self, settings: UnknownSettings) -> Float[Tensor, " j"]:
-        """Prior of each offset, rad or mm; zero for a joint that does not move the shaft."""
-        least = [_MOVES[column.rpartition("_")[2]] for column in self.columns]
-        moves = self._joint.abs().amax(dim=(0, 1)) > self._joint.new_tensor(least)
-        return joint_sigma(self.columns, moves, settings)
-
     def at(self, base: Problem, joint_offset: Float[Tensor, "b j"], clock_s: Float[Tensor, " b"]) -> Problem:
-        """The measurements of `base` with the shaft displaced as `b` sets of offsets say.
-
-        Args:
-            base: one trial axis of length 1, with the file's kinematics.
-            joint_offset: added to the readings, rad or mm.
-            clock_s: added to the times at which the joints are read.
-        """
         change = joint_offset - self._joint_at
         displacement = torch.einsum("muj,bj->bmu", self._joint, change)
-        displacement = displacement + self._clock * (clock_s - self.clock_at_s)[:, None, None]
+        displacement = displacement + self._clock * (clock_s - self._clock_at_s)[:, None, None]
         repeated = base.take_trials(torch.zeros(len(clock_s), dtype=torch.int64, device=joint_offset.device))
         return replace(
             repeated,
@@ -73,21 +54,15 @@ class FileUnknowns:
             clock_at=clock_s,
         )
 
-    def linearised(
-        self,
-        base: Problem,
-        joint_offset: Float[Tensor, "b j"],
-        clock_s: Float[Tensor, " b"],
-        sigma: Float[Tensor, " j"],
-    ) -> Problem:
-        """The same with the derivatives that make the offsets unknowns; `sigma` is the prior of each joint's."""
-        trials = len(clock_s)
-        return replace(
-            self.at(base, joint_offset, clock_s),
-            joint_derivative=self._joint.expand(trials, *self._joint.shape),
-            joint_offset_sigma=sigma.expand(trials, -1),
-            clock_derivative=self._clock.expand(trials, *self._clock.shape) if self.has_clock else None,
-        )
+    def joint_derivative(
+        self, joint_offset: Float[Tensor, "b j"], clock_s: Float[Tensor, " b"]
+    ) -> Float[Tensor, "b m 6 j"]:
+        return self._joint.expand(len(clock_s), *self._joint.shape)
+
+    def clock_derivative(
+        self, joint_derivative: Float[Tensor, "b m 6 j"], clock_s: Float[Tensor, " b"]
+    ) -> Float[Tensor, "b m 6"]:
+        return self._clock.expand(len(clock_s), *self._clock.shape)
 
 
 def file_unknowns(observations: ShaftObservations, settings: SolverSettings, device: str) -> FileUnknowns | None:

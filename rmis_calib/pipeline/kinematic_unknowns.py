@@ -9,34 +9,18 @@ from torch import Tensor
 
 from rmis_calib.geometry.rigid import rigid_inverse
 from rmis_calib.io import Recording
-from rmis_calib.io.observations import CLOCK
 from rmis_calib.kinematics import RobotKinematics
+from rmis_calib.pipeline.offset_unknowns import OffsetUnknowns
 from rmis_calib.pipeline.poses import MotionPoses, motion_poses
 from rmis_calib.results import KinematicOffsets
-from rmis_calib.solver import Problem, Solution
+from rmis_calib.robot import split_joint_column
+from rmis_calib.solver import Problem
 from rmis_calib.solver.model.residuals import rcm_axes
-from rmis_calib.solver.settings import UnknownSettings
 
 _STEP = {"rad": 1e-5, "mm": 1e-3}
 """Steps of the central differences: their error, step^2 times a third derivative of order 1, is below rounding."""
 _CONTINUOUS_LOG_S = 0.2
 """A log sampled more slowly is a list of poses, in which there is no velocity and so no clock to estimate."""
-_MOVES_MM = 1e-6
-"""A joint whose unit step moves the shaft by less than this (the wrist's joints) has no offset that could be seen."""
-
-
-def joint_sigma(columns: tuple[str, ...], moves: Bool[Tensor, " j"], settings: UnknownSettings) -> Float[Tensor, " j"]:
-    """Prior of each joint's offset, rad or mm; zero for a joint that does not move the shaft."""
-    sigma = {"rad": np.deg2rad(settings.joint_offset_sigma_deg), "mm": settings.joint_offset_sigma_mm}
-    values = [sigma[column.rpartition("_")[2]] for column in columns]
-    return torch.where(moves, torch.tensor(values, dtype=torch.float64, device=moves.device), 0.0)
-
-
-def estimated_offsets(solution: Solution, columns: tuple[str, ...], like: Tensor) -> tuple[Float[Tensor, " j"], float]:
-    """Joint offsets (rad or mm) and clock offset (s) of a solution; zero where they were not estimated."""
-    found = {name: nuisance.value.reshape(-1) for name, nuisance in solution.nuisances.items()}
-    joint_offset = found.get("joint_offset", like.new_zeros(len(columns)))
-    return joint_offset, float(found["clock"]) if "clock" in found else 0.0
 
 
 def poses_at(recording: Recording, offsets: KinematicOffsets, device: str = "cpu") -> MotionPoses:
@@ -76,8 +60,8 @@ def with_rcm_offset(poses: MotionPoses, rcm_mm: tuple[float, float]) -> MotionPo
     return replace(poses, arm_T_rcm=arm_T_rcm)
 
 
-class KinematicUnknowns:
-    """Poses of the motions at any joint offsets and clock offset, with their derivatives."""
+class KinematicUnknowns(OffsetUnknowns):
+    """The effect of the offsets from the joint log and both arms' kinematics, at any offsets."""
 
     def __init__(self, recording: Recording, frames: np.ndarray, device: str) -> None:
         """Keep what the poses depend on.
@@ -91,39 +75,23 @@ class KinematicUnknowns:
             recording.robot, recording.laparoscope_arm, recording.instrument_arm, device=device
         )
         arms = [arm for arm in (recording.laparoscope_arm, recording.instrument_arm) if arm is not None]
-        self.columns = tuple(column for arm in arms for column in recording.robot.columns(arm))
-        """`<arm>.<joint>_rad` or `_mm`: the joints whose offsets are unknowns, laparoscope first."""
+        self.columns = tuple(recording.robot.joints(*arms))
         self._log = recording.joints.select(self.columns)
         self._times = recording.frame_times_s[frames] + recording.clock_offset_s
         intervals_s = np.diff(self._log.timestamps_s)
+        # In a log of poses there is no velocity.
         self.has_clock = len(intervals_s) > 0 and float(np.median(intervals_s)) <= _CONTINUOUS_LOG_S
-        """Whether the log is continuous enough for a clock offset to mean anything."""
+        self.clock_at_s = None
         self._device = device
         self._split = len(self._kinematics.laparoscope_joints)
-        steps = [_STEP[column.rpartition("_")[2]] for column in self.columns]
+        steps = [_STEP[split_joint_column(column)[1]] for column in self.columns]
         self._steps = torch.tensor(steps, dtype=torch.float64, device=device)
-
-    def prior_sigma(self, settings: UnknownSettings) -> Float[Tensor, " j"]:
-        """Prior of each offset, rad or mm; zero for a joint that does not move the shaft."""
-        return joint_sigma(self.columns, self.moves_shaft(), settings)
-
-    def moves_shaft(self) -> Bool[Tensor, " j"]:
-        """Which joints move the shaft as the camera sees it; those of the wrist do not."""
-        derivative = self._derivative(self._readings(torch.zeros(1, dtype=torch.float64))[0])
-        return derivative.abs().amax(dim=(0, 1, 2)) * self._steps / self._steps.max() > _MOVES_MM
 
     def readings_of_motions(self, clock_s: float) -> Float[Tensor, "m j"]:
         """Logged readings of every motion, rad or mm."""
         return self._readings(torch.tensor([clock_s], dtype=torch.float64))[0][0]
 
     def at(self, base: Problem, joint_offset: Float[Tensor, "b j"], clock_s: Float[Tensor, " b"]) -> Problem:
-        """The measurements of `base` with the kinematics evaluated at `b` sets of offsets.
-
-        Args:
-            base: one trial axis of length 1.
-            joint_offset: added to the readings, rad or mm.
-            clock_s: added to the times at which the joints are read.
-        """
         readings, known = self._readings(clock_s)
         arm_T_rcm, v, s_end, p_head = self._poses(readings + joint_offset[:, None])
         repeated = base.take_trials(torch.zeros(len(clock_s), dtype=torch.int64, device=joint_offset.device))
@@ -138,26 +106,21 @@ class KinematicUnknowns:
             clock_at=clock_s,
         )
 
-    def linearised(
-        self,
-        base: Problem,
-        joint_offset: Float[Tensor, "b j"],
-        clock_s: Float[Tensor, " b"],
-        sigma: Float[Tensor, " j"],
-    ) -> Problem:
-        """The same with the derivatives that make the offsets unknowns; `sigma` is the prior of each joint's."""
-        derivative = self._derivative(self._readings(clock_s)[0] + joint_offset[:, None])
-        return replace(
-            self.at(base, joint_offset, clock_s),
-            joint_derivative=derivative,
-            joint_offset_sigma=sigma.expand(len(clock_s), -1),
-            clock_derivative=(derivative @ self._velocity(clock_s)[..., None])[..., 0] if self.has_clock else None,
-        )
+    def joint_derivative(
+        self, joint_offset: Float[Tensor, "b j"], clock_s: Float[Tensor, " b"]
+    ) -> Float[Tensor, "b m 6 j"]:
+        return self._jacobian(self._readings(clock_s)[0] + joint_offset.to(self._device)[:, None])
+
+    def clock_derivative(
+        self, joint_derivative: Float[Tensor, "b m 6 j"], clock_s: Float[Tensor, " b"]
+    ) -> Float[Tensor, "b m 6"]:
+        velocity = torch.as_tensor(self._log.interpolate(self._times_at(clock_s))[1], device=self._device)
+        return (joint_derivative @ velocity[..., None])[..., 0]  # velocity: (b, m, j), unit per second
 
     def resting_at(self, base: Problem, readings: Float[Tensor, "m j"], joint_offset: Float[Tensor, " j"]) -> Problem:
         """The motions of `base` (one trial) with the arms at rest at these readings; rad or mm, offsets to be added."""
         arm_T_rcm, v, s_end, p_head = self._poses(readings + joint_offset)
-        derivative = self._derivative((readings + joint_offset)[None])
+        derivative = self._jacobian((readings + joint_offset)[None])
         return replace(
             base,
             arm_T_rcm=arm_T_rcm[None],
@@ -167,17 +130,6 @@ class KinematicUnknowns:
             joint_derivative=derivative,
             clock_derivative=torch.zeros_like(derivative[..., 0]),
         )
-
-    def displacements(self, joint_offset: Float[Tensor, " j"], clock_s: float) -> dict[str, np.ndarray]:
-        """What an observations file says about the offsets, at one set of them: the `unknown_*` arrays."""
-        clock = torch.tensor([clock_s], dtype=torch.float64)
-        derivative = self._derivative(self._readings(clock)[0] + joint_offset)  # (1, m, 6, j)
-        names, at = list(self.columns), [*joint_offset.tolist()]
-        if self.has_clock:
-            derivative = torch.cat((derivative, derivative @ self._velocity(clock)[..., None]), dim=-1)
-            names, at = [*names, CLOCK], [*at, clock_s]
-        displacement = derivative[0].mT.cpu().numpy()
-        return {"unknown_names": np.array(names), "unknown_displacement": displacement, "unknown_at": np.array(at)}
 
     def motion_poses(
         self, frames: np.ndarray, joint_offset: Float[Tensor, " j"], clock_s: float
@@ -201,14 +153,10 @@ class KinematicUnknowns:
         known = known.reshape(times.shape)
         return torch.as_tensor(readings, device=self._device), torch.as_tensor(known, device=self._device)
 
-    def _velocity(self, clock_s: Float[Tensor, " b"]) -> Float[Tensor, "b m j"]:
-        """Of the readings, unit per second."""
-        return torch.as_tensor(self._log.interpolate(self._times_at(clock_s))[1], device=self._device)
-
     def _times_at(self, clock_s: Float[Tensor, " b"]) -> np.ndarray:
         return self._times + clock_s.cpu().numpy()[:, None]
 
-    def _derivative(self, readings: Float[Tensor, "b m j"]) -> Float[Tensor, "b m 6 j"]:
+    def _jacobian(self, readings: Float[Tensor, "b m j"]) -> Float[Tensor, "b m 6 j"]:
         """Displacement of the shaft as a rigid body, in `rcm`, per unit of each joint; all joints in one call."""
         steps = torch.diag(self._steps)[:, None, None]
         both = torch.stack([readings + steps, readings - steps])  # (2, j, b, m, j)

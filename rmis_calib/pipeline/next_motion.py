@@ -17,7 +17,9 @@ from torch import Tensor
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.geometry.cameras import Camera
 from rmis_calib.io import Recording
-from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns, estimated_offsets
+from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
+from rmis_calib.pipeline.offset_unknowns import estimated_offsets
+from rmis_calib.robot import split_joint_column
 from rmis_calib.solver import Problem, Solution, SolveStatus
 from rmis_calib.solver.assess.next_motion import Advice, advise, measured_alike
 from rmis_calib.solver.observability import Verdict
@@ -154,7 +156,7 @@ def joint_candidates(
     readings = _readings(home, low, high, free, settings.candidates, np.random.default_rng(seed))
     base = measured_alike(problem.flatten_batch(), len(readings))
     at = unknowns.resting_at(base, torch.as_tensor(readings).to(joint_offset), joint_offset)
-    units = np.array([_CHANGED[column.rpartition("_")[2]] for column in unknowns.columns])
+    units = np.array([_CHANGED[split_joint_column(column)[1]] for column in unknowns.columns])
     changed = np.abs(readings - home) > units
     pairs = zip(readings, changed, strict=True)
     words = tuple(_joint_words(unknowns.columns, home, row, moved) for row, moved in pairs)
@@ -166,12 +168,8 @@ def joint_box(
 ) -> tuple[Float[np.ndarray, " j"], Float[np.ndarray, " j"]]:
     """Least and greatest reading of each joint: what was logged, widened by the reach, within the robot's limits."""
     reach = {"rad": np.deg2rad(settings.reach_deg), "mm": settings.reach_mm}
-    wide = np.array([reach[column.rpartition("_")[2]] for column in columns])
-    joints = {
-        column: joint
-        for name, arm in recording.robot.arms.items()
-        for column, joint in zip(recording.robot.columns(name), arm.joints, strict=True)
-    }
+    wide = np.array([reach[split_joint_column(column)[1]] for column in columns])
+    joints = recording.robot.joints(*recording.robot.arms)
     least = np.array([-np.inf if joints[column].min is None else joints[column].min for column in columns])
     greatest = np.array([np.inf if joints[column].max is None else joints[column].max for column in columns])
     return np.clip(logged.min(0) - wide, least, greatest), np.clip(logged.max(0) + wide, least, greatest)
@@ -208,7 +206,7 @@ def _joint_words(columns: tuple[str, ...], home: np.ndarray, readings: np.ndarra
     moves = []
     for column, before, after, moved in zip(columns, home, readings, changed, strict=True):
         if moved:
-            name, _, unit = column.rpartition("_")
+            name, unit = split_joint_column(column)
             before, after, unit = (before, after, "mm") if unit == "mm" else (*np.rad2deg((before, after)), "deg")
             moves.append(f"{name} from {before:.1f} to {after:.1f} {unit}")
     if not moves:

@@ -86,6 +86,8 @@ def test_contracts_say_what_the_design_says() -> None:
         ("rmis_calib/vision/__init__.py", "import rmis_calib.io", "layers"),
         ("rmis_calib/kinematics.py", "def f():\n    from rmis_calib.io import x", "layers"),
         ("rmis_calib/pipeline.py", "import rmis_calib.cli", "layers"),
+        ("rmis_calib/robot.py", "import rmis_calib.io", "a robot knows nothing of what uses it"),
+        ("rmis_calib/geometry.py", "import rmis_calib.robot", "geometry knows nothing of robots"),
         ("rmis_calib/solver/__init__.py", "import data_synth", "only studies and cli use data_synth"),
         ("data_synth/__init__.py", "import rmis_calib.geometry", "data_synth is made of its own code"),
         ("rmis_calib/solver/model.py", "import rmis_calib.solver.estimate", "stages of the solver"),

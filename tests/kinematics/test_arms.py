@@ -9,8 +9,9 @@ from torch.autograd import gradcheck
 
 from rmis_calib.errors import RobotError, ShapeError
 from rmis_calib.geometry import rigid_inverse, transform_points
-from rmis_calib.io.robot import Arm, HeadPoint, Robot, load_robot
+from rmis_calib.io.robot import load_robot
 from rmis_calib.kinematics import RobotKinematics
+from rmis_calib.robot import Arm, HeadPoint, Robot
 
 PRESETS = ["dvrk-classic", "dvrk-classic-si-tool", "dvrk-si", "rcm-3x3"]
 

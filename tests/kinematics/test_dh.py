@@ -1,6 +1,6 @@
 """DH tables as chains, against matrices derived by hand in NumPy."""
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,25 +9,14 @@ from torch.autograd import gradcheck, gradgradcheck
 
 from rmis_calib.errors import RobotError, ShapeError
 from rmis_calib.kinematics import build_chain, dh_matrix, frame_poses
-
-
-@dataclass(frozen=True)
-class Row:
-    name: str
-    type: str
-    alpha_rad: float
-    a_mm: float
-    theta_rad: float
-    d_mm: float
-    offset: float = 0.0
-
+from rmis_calib.robot import Joint
 
 # Every entry differs from zero, so that no factor of the product can be left out or put in the wrong place unseen.
 TABLE = [
-    Row("one", "revolute", 0.3, 11.0, -0.7, 5.0),
-    Row("two", "prismatic", -1.1, -3.0, 0.4, 40.0),
-    Row("three", "revolute", 0.8, 7.0, 1.9, -6.0),
-    Row("four", "revolute", -0.2, 0.5, 0.1, 2.0),
+    Joint("one", "revolute", 0.3, 11.0, -0.7, 5.0, 0.0),
+    Joint("two", "prismatic", -1.1, -3.0, 0.4, 40.0, 0.0),
+    Joint("three", "revolute", 0.8, 7.0, 1.9, -6.0, 0.0),
+    Joint("four", "revolute", -0.2, 0.5, 0.1, 2.0, 0.0),
 ]
 READINGS = [0.25, -12.0, 1.4, -0.6]
 
@@ -45,7 +34,7 @@ def shift(axis: str, length: float) -> np.ndarray:
     return T
 
 
-def by_hand(table: list[Row], readings: list[float], convention: str) -> np.ndarray:
+def by_hand(table: list[Joint], readings: list[float], convention: str) -> np.ndarray:
     """Poses of frame 0 to frame J, one elementary matrix after the other."""
     frames = [np.eye(4)]
     for row, q in zip(table, readings, strict=True):
@@ -131,7 +120,9 @@ def test_precision_is_never_mixed_silently() -> None:
 def test_impossible_tables_are_refused() -> None:
     with pytest.raises(RobotError, match="modified or standard"):
         build_chain(TABLE, "craig", torch.float64)
+    fixed = replace(TABLE[0])
+    object.__setattr__(fixed, "type", "fixed")  # what a type checker would have refused
     with pytest.raises(RobotError, match="joint one: expected type revolute or prismatic, found 'fixed'"):
-        build_chain([Row("one", "fixed", 0, 0, 0, 0)], "modified", torch.float64)
+        build_chain([fixed], "modified", torch.float64)
     with pytest.raises(RobotError, match="at least one joint"):
         build_chain([], "modified", torch.float64)
