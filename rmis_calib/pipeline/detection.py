@@ -82,6 +82,10 @@ class View:
         """(N,) frames with at least one shaft."""
         return self.detections.valid.any(dim=-1)
 
+    def at(self, frames: np.ndarray) -> ShaftDetections:
+        """The detections of some frames, by their numbers."""
+        return self.detections.of_frames(torch.as_tensor(frames, device=self.detections.valid.device))
+
 
 @dataclass(frozen=True, eq=False)
 class DetectionTable:

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.geometry.cameras import Camera
-from rmis_calib.pipeline.choosing import Choice
-from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns, poses_at_motions
-from rmis_calib.pipeline.observing import ANOTHER_INSTRUMENT, select_frames
+from rmis_calib.pipeline.association import Choice
+from rmis_calib.pipeline.observations import ANOTHER_INSTRUMENT
+from rmis_calib.pipeline.offset_unknowns import KinematicUnknowns, poses_at_motions
 from rmis_calib.pipeline.run import CalibrationRun
 from rmis_calib.results import CalibrationResult
 from rmis_calib.solver import MotionReason, SolveStatus
@@ -36,15 +36,15 @@ _TELLING = (SolveStatus.CONVERGED, SolveStatus.SINGULAR, SolveStatus.NON_FINITE)
 """How a solve can end that says nothing against the model by itself."""
 
 
-def with_misfit_named(run: CalibrationRun, config: CalibrationConfig) -> CalibrationResult:
-    """The result; one that is not trustworthy because pictures and joints do not fit says so first, with the causes."""
+def with_misfit_named(run: CalibrationRun, config: CalibrationConfig) -> CalibrationRun:
+    """The run; a result that is not trustworthy as pictures and joints do not fit says so first, with the causes."""
     result, solution = run.result, run.solution
     if solution is None or result.camera_right_T_arm is None or result.trustworthy:
-        return result
+        return run
     if SolveStatus(int(solution.status)) in _TELLING and not is_misfit(result):
-        return result
+        return run
     unknowns = KinematicUnknowns(run.recording, run.poses.frames, config.device)
-    found = [select_frames(view.detections, run.poses.frames) for view in run.views]
+    found = [view.at(run.poses.frames) for view in run.views]
     moved = None
     if unknowns.has_clock:
         at = poses_at_motions(unknowns, run.poses, result.kinematic_offsets, VELOCITY_STEP_S)
@@ -57,7 +57,7 @@ def with_misfit_named(run: CalibrationRun, config: CalibrationConfig) -> Calibra
             parts.append(signed_residuals(detections, choice, now, later, VELOCITY_STEP_S, view.camera))
     repeated = sum(reason == FrameReason.REPEATED.sentence for reason in result.motions.reasons)
     causes = likely_causes(joined_residuals(parts), _disparity(run, found), repeated) if parts else []
-    return replace(result, message=misfit_message(result, causes))
+    return replace(run, result=replace(result, message=misfit_message(result, causes)))
 
 
 def _disparity(run: CalibrationRun, found: list[ShaftDetections]) -> float | None:

@@ -8,7 +8,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rmis_calib.errors import RobotError
-from rmis_calib.geometry.rigid import rigid_inverse
+from rmis_calib.geometry.lines import contour_planes
+from rmis_calib.geometry.rigid import rigid_inverse, rotate_vectors, transform_points
 from rmis_calib.io import Recording
 from rmis_calib.kinematics import RobotKinematics
 
@@ -72,3 +73,17 @@ def _check_apart(recording: Recording, distance_mm: float | None) -> None:
         ),
         found=f"both within {max(distance_mm, 0.1):.1f} mm of one point",
     )
+
+
+def predict_contours(
+    camera_T_arm: Float[Tensor, "4 4"], poses: MotionPoses, radius_mm: float
+) -> Float[Tensor, "m 2 3"]:
+    """Contour planes of the shaft where kinematics and calibration put it, in one camera."""
+    camera_T_rcm = camera_T_arm @ poses.arm_T_rcm
+    return contour_planes(camera_T_rcm[..., :3, 3], rotate_vectors(camera_T_rcm, poses.rcm_v_axis), radius_mm)
+
+
+def predict_ends(camera_T_arm: Float[Tensor, "4 4"], poses: MotionPoses, offset_mm: float) -> Float[Tensor, "m 3"]:
+    """The shaft's end on the axis, in one camera, mm."""
+    rcm_p_end = poses.rcm_v_axis * (poses.rcm_s_end_mm + offset_mm)[:, None]
+    return transform_points(camera_T_arm @ poses.arm_T_rcm, rcm_p_end)

@@ -1,15 +1,14 @@
 """One calibration with everything that it came from."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from jaxtyping import Float
 from torch import Tensor
 
 from rmis_calib.io import Recording, ShaftObservations
-from rmis_calib.pipeline.choosing import Choice
+from rmis_calib.pipeline.association import Choice
 from rmis_calib.pipeline.detection import View
-from rmis_calib.pipeline.observing import predict_contours, predict_ends
-from rmis_calib.pipeline.poses import MotionPoses
+from rmis_calib.pipeline.poses import MotionPoses, predict_contours, predict_ends
 from rmis_calib.results import CalibrationResult
 from rmis_calib.solver import Solution
 
@@ -35,6 +34,10 @@ class CalibrationRun:
     choices: tuple[Choice, ...]
     observations: ShaftObservations | None
     solution: Solution | None
+
+    def with_notes(self, notes: tuple[str, ...]) -> "CalibrationRun":
+        """The run with notes on what was read, before what is noted already."""
+        return replace(self, result=replace(self.result, notes=notes + self.result.notes))
 
     @property
     def clock_s(self) -> float | None:

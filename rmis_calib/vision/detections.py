@@ -82,8 +82,8 @@ class ShaftDetections:
     blur_px: Float[Tensor, "b k 2"]
     """Standard deviation of the blur of each contour, px."""
 
-    def of_frames(self, which: Bool[Tensor, " b"]) -> "ShaftDetections":
-        """Those of the frames in the mask."""
+    def of_frames(self, which: Bool[Tensor, " b"] | Int[Tensor, " m"]) -> "ShaftDetections":
+        """Those of the frames in the mask, or of these numbers."""
         return ShaftDetections(**{name: value[which] for name, value in vars(self).items()})
 
     def surest_first(self) -> "ShaftDetections":

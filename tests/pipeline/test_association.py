@@ -12,16 +12,16 @@ import rmis_calib as rc
 from rmis_calib.config import parse_config
 from rmis_calib.errors import InputError
 from rmis_calib.geometry.lines import contour_planes
-from rmis_calib.pipeline.calibration import run_calibration
-from rmis_calib.pipeline.choosing import (
+from rmis_calib.pipeline.association import (
     association_gate,
     choices_by_instrument,
     consistent_choice,
     first_choice,
+    first_choices,
     pointed_at,
+    read_prior,
 )
-from rmis_calib.pipeline.observing import select_frames
-from rmis_calib.pipeline.starting import first_choices, read_prior
+from rmis_calib.pipeline.calibration import run_calibration
 from rmis_calib.vision import ShaftDetections
 
 RADIUS_MM = 4.0
@@ -197,7 +197,7 @@ def test_the_instrument_that_moves_with_the_joints_is_the_one_that_calibrates(tm
 
 def check_what_is_known_beforehand(recording, run, config, folder):
     """A prior and a pointing user lead to the candidates that the joints led to."""
-    found = tuple(select_frames(view.detections, run.poses.frames) for view in run.views)
+    found = tuple(view.at(run.poses.frames) for view in run.views)
     instruments = choices_by_instrument(found)
     assert len(instruments) >= 2
 

@@ -11,7 +11,7 @@ from rmis_calib.config import parse_config
 from rmis_calib.geometry.rigid import rigid_inverse
 from rmis_calib.geometry.rotations import matrix_to_rotvec
 from rmis_calib.pipeline.estimation import estimate_with_kinematics
-from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
+from rmis_calib.pipeline.offset_unknowns import KinematicUnknowns
 from rmis_calib.pipeline.poses import motion_poses
 
 CLOCK_S = 0.72

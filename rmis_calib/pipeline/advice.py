@@ -1,11 +1,14 @@
 """Advice on the next motion, in words: candidates from both arms' joints, or, without kinematics, from the picture.
 
 Joints stay within their limits and near to what the recording shows, since nobody has seen what is beyond; the shaft
-stays in the field of view. The estimate that predicts all this is the present one.
+stays in the field of view. Without kinematics (an observations file) the instrument swings about its RCM and slides
+along its shaft; the laparoscope swings about a pivot behind the camera on the viewing axis, slides along that axis and
+rolls about it: what an arm with a remote centre can do to a 0 degree endoscope, near enough to tell which motion is
+worth making. The estimate that predicts all this is the present one.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
 
@@ -16,9 +19,13 @@ from torch import Tensor
 
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.geometry.cameras import Camera
+from rmis_calib.geometry.rigid import rigid_from_rotation_translation, rigid_inverse
+from rmis_calib.geometry.rotations import rotvec_to_matrix
 from rmis_calib.io import Recording
-from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
-from rmis_calib.pipeline.offset_unknowns import estimated_offsets
+from rmis_calib.pipeline.observations import problem_of
+from rmis_calib.pipeline.offset_unknowns import KinematicUnknowns, estimated_offsets
+from rmis_calib.pipeline.result import used_motions
+from rmis_calib.pipeline.run import CalibrationRun
 from rmis_calib.robot import split_joint_column
 from rmis_calib.solver import Problem, Solution, SolveStatus
 from rmis_calib.solver.assess.next_motion import Advice, advise, measured_alike
@@ -34,6 +41,35 @@ _CHANGED = {"rad": 0.005, "mm": 0.25}
 """A smaller change of a reading is none."""
 _PREDICTS = (SolveStatus.CONVERGED, SolveStatus.SINGULAR, SolveStatus.MAX_ITERATIONS, SolveStatus.STALLED)
 """How a solve must have ended for its estimate to predict anything."""
+PIVOT_BEHIND_MM = 120.0
+"""Assumed distance of the laparoscope's trocar behind the camera."""
+WHERE = (
+    "near to the last motion (an observations file tells no joints, so they are named as the right picture shows them; "
+    "one of the laparoscope counts only where its arm is logged)"
+)
+_LEAST_ACROSS = 0.5
+"""Sine to the shaft below which a direction of the picture is none in which the tip could swing."""
+_SIDES = {
+    "to the right": (1.0, 0.0, 0.0),
+    "to the left": (-1.0, 0.0, 0.0),
+    "down": (0.0, 1.0, 0.0),
+    "up": (0.0, -1.0, 0.0),
+    "away from the camera": (0.0, 0.0, 1.0),
+    "towards the camera": (0.0, 0.0, -1.0),
+}
+"""Directions in `camera_right`."""
+_TURNS = {
+    "to the right": (0.0, 1.0, 0.0),
+    "to the left": (0.0, -1.0, 0.0),
+    "up": (1.0, 0.0, 0.0),
+    "down": (-1.0, 0.0, 0.0),
+    "clockwise": (0.0, 0.0, 1.0),
+    "anticlockwise": (0.0, 0.0, -1.0),
+}
+"""Axes in `camera_right` (y points down) about which the view turns that way."""
+_PARTS = (0.5, 1.0)
+"""Parts of the reach that are tried."""
+Words = tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +95,23 @@ def may_advise(solution: Solution, config: CalibrationConfig) -> bool:
     """Whether there is an estimate that predicts what a motion would tell, and advice is wanted."""
     predicts = solution.posterior is not None and SolveStatus(int(solution.status)) in _PREDICTS
     return predicts and config.solver.advice.motions > 0
+
+
+def with_next_motions(run: CalibrationRun, config: CalibrationConfig) -> CalibrationRun:
+    """The run with the motions in its result that would help most."""
+    if run.observations is None or run.solution is None or not may_advise(run.solution, config):
+        return run
+    problem = problem_of(run.observations, config)
+    used, _ = used_motions(run.solution)
+    unknowns = KinematicUnknowns(run.recording, run.poses.frames, config.device)
+    settings, seed = config.solver.advice, config.solver.seed
+    candidates = joint_candidates(run.recording, unknowns, problem, run.solution, used, settings, seed=seed)
+    stereo = run.recording.stereo
+    cameras = [camera for camera in (stereo.right, stereo.left) if camera is not None][: problem.n_cameras]
+    view = torch.stack([camera_view(camera) for camera in cameras]).to(config.device)
+    record = advice_record(run.solution, candidates, view, config, limits_in_words(settings))
+    result = replace(run.result, observability=run.result.observability | record)
+    return replace(run, result=result)
 
 
 def advice_record(
@@ -215,11 +268,6 @@ def _joint_words(columns: tuple[str, ...], home: np.ndarray, readings: np.ndarra
     return f"move {joined(moves)}{rest}"
 
 
-def joined(parts: list[str]) -> str:
-    """Parts of a sentence as a list in words."""
-    return parts[0] if len(parts) == 1 else ", ".join(parts[:-1]) + " and " + parts[-1]
-
-
 def camera_view(camera: Camera) -> Float[Tensor, "4"]:
     """Least x, least y, greatest x, greatest y of the upright rectangle inside of the undistorted picture, less a
     margin."""
@@ -252,3 +300,87 @@ def limits_in_words(settings: AdviceSettings) -> str:
         f"within the joint limits, at most {settings.reach_deg:g} deg and {settings.reach_mm:g} mm outside of the "
         "readings of the recording"
     )
+
+
+def pose_candidates(problem: Problem, solution: Solution, motion: int, settings: AdviceSettings) -> Candidates:
+    """What the instrument, the laparoscope and both can do from one motion on.
+
+    Args:
+        problem: what was solved, with one trial axis of length 1.
+        solution: its answer.
+        motion: index of the motion to start from.
+        settings: how far to go.
+    """
+    camera_right_T_arm = solution.camera_right_T_arm.reshape(4, 4)
+    arm_T_rcm, v = problem.arm_T_rcm[0, motion], problem.rcm_v_axis[0, motion]
+    swings = _swings(camera_right_T_arm[:3, :3] @ arm_T_rcm[:3, :3], v, math.radians(settings.reach_deg))
+    slides = _slides(problem, settings.reach_mm)
+    moves = _laparoscope_moves(camera_right_T_arm, settings)
+    # The first of each is to do nothing; all three together are no motion.
+    triples = [(i, j, k) for i in range(len(swings)) for j in range(len(slides)) for k in range(len(moves))][1:]
+    words = [(*swings[i][0], *slides[j][0], *moves[k][0]) for i, j, k in triples]
+    turn = torch.stack([swings[i][1] for i, _, _ in triples])
+    slide_mm = torch.tensor([slides[j][1] for _, j, _ in triples], dtype=v.dtype, device=v.device)
+    steps = torch.stack([moves[k][1] for _, _, k in triples])
+    like = measured_alike(problem, len(triples), motion)
+    turned_v = turn @ v
+    poses = rigid_inverse(steps) @ arm_T_rcm  # seen from the arm where it is then
+    at = replace(
+        like,
+        arm_T_rcm=poses[None],
+        rcm_v_axis=turned_v[None],
+        clock_derivative=None if like.clock_derivative is None else torch.zeros_like(like.clock_derivative),
+        rcm_s_end_mm=like.rcm_s_end_mm + slide_mm,
+        rcm_p_head=(turn @ problem.rcm_p_head[0, motion] + slide_mm[:, None] * turned_v)[None],
+    )
+    return Candidates(at, torch.tensor([len(parts) for parts in words]), tuple(joined(list(parts)) for parts in words))
+
+
+def _swings(
+    camera_right_R_rcm: Float[Tensor, "3 3"], v: Float[Tensor, "3"], reach_rad: float
+) -> list[tuple[Words, Float[Tensor, "3 3"]]]:
+    """Turns of the shaft about its RCM, in `rcm`, by where its tip goes in the picture."""
+    out: list[tuple[Words, Tensor]] = [((), torch.eye(3, dtype=v.dtype, device=v.device))]
+    for side, direction in _SIDES.items():
+        axis = torch.linalg.cross(v, camera_right_R_rcm.mT @ v.new_tensor(direction))
+        if float(axis.norm()) < _LEAST_ACROSS:
+            continue
+        for part in _PARTS:
+            words = f"swing the instrument's tip {math.degrees(part * reach_rad):.3g} deg {side}"
+            out.append(((words,), rotvec_to_matrix(part * reach_rad * axis / axis.norm())))
+    return out
+
+
+def _slides(problem: Problem, reach_mm: float) -> list[tuple[Words, float]]:
+    """Ways along the shaft, mm; none where nothing in the pictures would show them."""
+    out: list[tuple[Words, float]] = [((), 0.0)]
+    if bool(torch.isfinite(problem.end_xy).any()) or bool(torch.isfinite(problem.head_xy).any()):
+        for part in _PARTS:
+            out.append(((f"insert the instrument by {part * reach_mm:.3g} mm",), part * reach_mm))
+            out.append(((f"withdraw the instrument by {part * reach_mm:.3g} mm",), -part * reach_mm))
+    return out
+
+
+def _laparoscope_moves(
+    camera_right_T_arm: Float[Tensor, "4 4"], settings: AdviceSettings
+) -> list[tuple[Words, Float[Tensor, "4 4"]]]:
+    """Places of `arm` after moves of the laparoscope, in `arm` before them."""
+    pivot = camera_right_T_arm.new_tensor((0.0, 0.0, -PIVOT_BEHIND_MM))
+    eye = torch.eye(3, dtype=pivot.dtype, device=pivot.device)
+    camera_right_T_moved: list[tuple[Words, Tensor]] = [((), torch.eye(4).to(pivot))]
+    for part in _PARTS:
+        for side, axis in _TURNS.items():
+            R = rotvec_to_matrix(math.radians(part * settings.reach_deg) * pivot.new_tensor(axis))
+            words = f"turn the laparoscope's view {part * settings.reach_deg:.3g} deg {side}"
+            camera_right_T_moved.append(((words,), rigid_from_rotation_translation(R, pivot - R @ pivot)))
+        for verb, sign in (("insert", 1.0), ("withdraw", -1.0)):
+            shift = pivot.new_tensor((0.0, 0.0, sign * part * settings.reach_mm))
+            words = f"{verb} the laparoscope by {part * settings.reach_mm:.3g} mm"
+            camera_right_T_moved.append(((words,), rigid_from_rotation_translation(eye, shift)))
+    arm_T_camera_right = rigid_inverse(camera_right_T_arm)
+    return [(words, arm_T_camera_right @ moved @ camera_right_T_arm) for words, moved in camera_right_T_moved]
+
+
+def joined(parts: list[str]) -> str:
+    """Parts of a sentence as a list in words."""
+    return parts[0] if len(parts) == 1 else ", ".join(parts[:-1]) + " and " + parts[-1]

@@ -14,9 +14,9 @@ import rmis_calib as rc
 from data_synth.scene import build_scene
 from data_synth.settings import SceneSettings
 from rmis_calib.config import parse_config
+from rmis_calib.pipeline.advice import advice_record, camera_view, joint_box, joint_candidates, seen_view
 from rmis_calib.pipeline.estimation import estimate, problem_of
-from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
-from rmis_calib.pipeline.next_motion import advice_record, camera_view, joint_box, joint_candidates, seen_view
+from rmis_calib.pipeline.offset_unknowns import KinematicUnknowns
 from rmis_calib.pipeline.poses import motion_poses
 from rmis_calib.solver.assess.observability import assess
 

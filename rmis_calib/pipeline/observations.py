@@ -4,34 +4,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from rmis_calib.config import CalibrationConfig
-from rmis_calib.geometry.lines import contour_planes
-from rmis_calib.geometry.rigid import rotate_vectors, transform_points
 from rmis_calib.io import Recording, ShaftObservations
-from rmis_calib.pipeline.choosing import Choice, reversed_direction
+from rmis_calib.pipeline.association import Choice, reversed_direction
 from rmis_calib.pipeline.detection import View
 from rmis_calib.pipeline.poses import MotionPoses
+from rmis_calib.solver import Problem
 from rmis_calib.vision import FrameReason, ShaftDetections
 
 DIRECTION_UNKNOWN = "the picture does not show on which side the tip is"
 ANOTHER_INSTRUMENT = "no shaft in the picture is where the joints put the instrument"
-
-
-def predict_contours(
-    camera_T_arm: Float[Tensor, "4 4"], poses: MotionPoses, radius_mm: float
-) -> Float[Tensor, "m 2 3"]:
-    """Contour planes of the shaft where kinematics and calibration put it, in one camera."""
-    camera_T_rcm = camera_T_arm @ poses.arm_T_rcm
-    return contour_planes(camera_T_rcm[..., :3, 3], rotate_vectors(camera_T_rcm, poses.rcm_v_axis), radius_mm)
-
-
-def predict_ends(camera_T_arm: Float[Tensor, "4 4"], poses: MotionPoses, offset_mm: float) -> Float[Tensor, "m 3"]:
-    """The shaft's end on the axis, in one camera, mm."""
-    rcm_p_end = poses.rcm_v_axis * (poses.rcm_s_end_mm + offset_mm)[:, None]
-    return transform_points(camera_T_arm @ poses.arm_T_rcm, rcm_p_end)
 
 
 def assemble(
@@ -54,7 +38,7 @@ def assemble(
     for view, choice in zip(views, choices, strict=True):
         camera = recording.stereo.left if view.side == "left" else recording.stereo.right
         model_sigma = config.model_sigma_px / float((camera or recording.stereo.right).focal)
-        arrays |= _measured(view.side, select_frames(view.detections, poses.frames), choice, model_sigma)
+        arrays |= _measured(view.side, view.at(poses.frames), choice, model_sigma)
     extrinsics = recording.stereo.camera_left_T_camera_right
     return ShaftObservations(
         arm_T_rcm=poses.arm_T_rcm.cpu().numpy(),
@@ -66,6 +50,11 @@ def assemble(
         **head_observations(recording, poses),
         **arrays,
     )
+
+
+def problem_of(observations: ShaftObservations, config: CalibrationConfig) -> Problem:
+    """The configured kinds of measurement as the solver's tensors."""
+    return Problem.from_observations(observations, device=config.device).only(*config.measurements)
 
 
 def head_observations(recording: Recording, poses: MotionPoses) -> dict[str, Any]:
@@ -89,7 +78,7 @@ def head_observations(recording: Recording, poses: MotionPoses) -> dict[str, Any
 
 def reasons_for(view: View, poses: MotionPoses, choice: Choice) -> list[str]:
     """(M,) why a motion has no shaft in this view; empty where it has one."""
-    found = select_frames(view.detections, poses.frames)
+    found = view.at(poses.frames)
     codes, taken = found.reason.cpu().numpy(), choice.taken.cpu().numpy()
     known = (found.valid & found.direction_known).any(-1).cpu().numpy()
     sentences = np.where(known, ANOTHER_INSTRUMENT, DIRECTION_UNKNOWN)
@@ -98,12 +87,6 @@ def reasons_for(view: View, poses: MotionPoses, choice: Choice) -> list[str]:
         "" if is_taken else (str(sentence) if is_seen else FrameReason(int(code)).sentence)
         for code, is_seen, is_taken, sentence in zip(codes, seen, taken, sentences, strict=True)
     ]
-
-
-def select_frames(detections: ShaftDetections, frames: np.ndarray) -> ShaftDetections:
-    """The detections of some frames."""
-    index = torch.as_tensor(frames, device=detections.valid.device)
-    return ShaftDetections(**{name: value[index] for name, value in vars(detections).items()})
 
 
 def _measured(side: str, detections: ShaftDetections, choice: Choice, model_sigma: float) -> dict[str, np.ndarray]:

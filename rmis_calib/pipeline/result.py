@@ -1,0 +1,227 @@
+"""The solver's tensors turned into a result with frames, units and a status."""
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from rmis_calib.config import CalibrationConfig
+from rmis_calib.geometry.rigid import RigidTransform
+from rmis_calib.io import Recording
+from rmis_calib.pipeline.association import (
+    Choice,
+)
+from rmis_calib.pipeline.detection import View
+from rmis_calib.pipeline.observations import reasons_for
+from rmis_calib.pipeline.poses import MotionPoses
+from rmis_calib.results import JOINT_OFFSET, STATUS_SENTENCES, CalibrationResult, Motions, Status
+from rmis_calib.robot import split_joint_column
+from rmis_calib.solver import Solution, SolveStatus
+from rmis_calib.solver.observability import Observability
+from rmis_calib.solver.status import MotionReason
+
+JOINTS_UNKNOWN = "the joint log does not cover this time"
+TOO_FEW = "usable, but there are too few"
+OTHER_TOOL_MM = 25.0
+"""Distance of the shaft's end from its nominal place that no wrist explains: the metal of one is 5 to 20 mm long."""
+TOO_FAR_SIGMA = 4.0
+"""An unknown estimated this many prior sigmas from its nominal value says that the model does not fit the data."""
+
+
+def make_result(
+    solution: Solution,
+    motions: Motions,
+    residuals: dict[str, dict[str, Any]],
+    config: CalibrationConfig,
+    joint_columns: tuple[str, ...] = (),
+    notes: tuple[str, ...] = (),
+) -> CalibrationResult:
+    """The result of one solve (no trial batch); `joint_columns` name its joint offsets, `notes` join what is said of
+    the data."""
+    status, message = judge(solution)
+    finite = bool(torch.isfinite(solution.camera_right_T_arm).all())
+    covariance = solution.covariance.cpu().numpy()
+    stereo = solution.camera_left_T_camera_right
+    return CalibrationResult(
+        status=status,
+        message=message,
+        method=solution.method,
+        camera_right_T_arm=_transform("camera_right", "arm", solution.camera_right_T_arm) if finite else None,
+        camera_left_T_camera_right=None if stereo is None else _transform("camera_left", "camera_right", stereo),
+        covariance=covariance if np.isfinite(covariance).all() else None,
+        observability=observability_record(solution.observability.describe(), (*notes, *_about_tool(solution))),
+        motions=motions,
+        residuals=residuals,
+        nuisances=_nuisance_records(solution, joint_columns),
+        config=config.to_dict(),
+    )
+
+
+def _about_tool(solution: Solution) -> tuple[str, ...]:
+    """Whether the shaft ends so far from where the tool's table says that it is another tool's."""
+    end = solution.nuisances.get("end_offset")
+    if end is None:
+        return ()
+    offset, sigma = float(end.value.reshape(-1)[0]), float(end.sigma.reshape(-1)[0])
+    if abs(offset) - 3.0 * sigma < OTHER_TOOL_MM:
+        return ()
+    where = "beyond" if offset > 0 else "before"
+    return (
+        f"The shaft ends {abs(offset):.0f} mm {where} the place that the tool's table tells: does the table belong "
+        "to another tool (the wrists of S/Si and Classic instruments are 50 mm apart), or is a wrist's length missing?",
+    )
+
+
+def judge(solution: Solution) -> tuple[Status, str]:
+    """Status and its one line: a solve that did not work first, then a model that does not fit, then sight."""
+    status = SolveStatus(int(solution.status))
+    observability = solution.observability.describe()
+    strange = _strange_unknown(solution)
+    if status is not SolveStatus.CONVERGED:
+        why = f"{STATUS_SENTENCES['solver_failed']}: {status.sentence}"
+        return "solver_failed", f"{why}; {strange}" if strange else why
+    if strange:
+        return "weak", f"{STATUS_SENTENCES['weak']}: {strange}"
+    names: dict[str, Status] = {"trustworthy": "ok", "weak": "weak", "unobservable": "unobservable"}
+    name = names[observability.verdict.value]
+    return name, f"{STATUS_SENTENCES[name]}: {observability.sentence}"
+
+
+def _strange_unknown(solution: Solution) -> str:
+    """The unknown that is furthest from its nominal value, in words, when it is further than its prior allows."""
+    # A lens model wrong by a tenth of a pixel is no reason for doubt: that is what `edge_bias` is there to take.
+    unknowns = {name: item for name, item in solution.nuisances.items() if name != "edge_bias"}
+    pulls = {name: float(nuisance.pull.abs().max()) for name, nuisance in unknowns.items()}
+    worst = max(pulls, key=lambda name: pulls[name], default="")
+    if not worst or pulls[worst] <= TOO_FAR_SIGMA:
+        return ""
+    where = f"the {worst.replace('_', ' ')} is estimated {pulls[worst]:.0f} prior sigmas from its nominal value"
+    return f"{where}: are the cameras swapped, is a unit or a file wrong, or the clock off?"
+
+
+def used_motions(solution: Solution) -> tuple[np.ndarray, tuple[str, ...]]:
+    """(N,) whether each motion of the solve was used, and why not."""
+    codes = [MotionReason(int(code)) for code in solution.reason.cpu()]
+    used = np.array([code in (MotionReason.USED, MotionReason.OUTLIER_ONE_CAMERA) for code in codes])
+    return used, tuple("" if code is MotionReason.USED else code.sentence for code in codes)
+
+
+def residuals_normalised(solution: Solution, used: np.ndarray) -> dict[str, dict[str, Any]]:
+    """Residuals per kind and camera in normalised image units, for observations without a camera."""
+    return {
+        name: residual_record(by_motion, "1e-3 of the focal length", used)
+        for name, by_motion in residual_arrays(solution, 1e3, 1e3).items()
+    }
+
+
+def residual_arrays(solution: Solution, scale_right: float, scale_left: float) -> dict[str, np.ndarray]:
+    """(N,) residuals of each kind and camera, times the camera's scale (its focal length turns them into px)."""
+    scales = (("right", scale_right), ("left", scale_left))
+    arrays = {}
+    for name, kind in (("contour", "lines"), ("end", "ends"), ("head", "heads")):
+        values = getattr(solution, f"residual_{kind}").cpu().numpy()
+        for row, (side, scale) in zip(values, scales, strict=False):
+            if np.isfinite(row).any():
+                arrays[f"{name}_{side}"] = row * scale
+    return arrays
+
+
+def residual_record(by_motion: np.ndarray, unit: str, used: np.ndarray) -> dict[str, Any]:
+    """Median and root mean square over the used motions, with the value of every motion that was measured."""
+    known = by_motion[np.isfinite(by_motion) & used]
+    median = float(np.median(known)) if len(known) else None
+    rms = float(np.sqrt(np.mean(known**2))) if len(known) else None
+    return {"unit": unit, "median": median, "rms": rms, "by_motion": by_motion}
+
+
+def observability_record(observability: Observability, notes: tuple[str, ...] = ()) -> dict[str, Any]:
+    """What the data can and cannot see, as plain values."""
+    return {
+        "verdict": observability.verdict.value,
+        "sentences": [observability.sentence, *notes],
+        "working_point_mm": list(observability.working_point_mm),
+        "working_point_sigma_mm": observability.working_point_sigma_mm,
+        "directions": [
+            {"sigma_at_working_point_mm": sigma, "words": words} for sigma, words in observability.directions
+        ],
+        "named_cases": list(observability.degeneracies),
+    }
+
+
+def _nuisance_records(solution: Solution, joint_columns: tuple[str, ...]) -> dict[str, dict[str, Any]]:
+    """Every other unknown with its sigma, and the noise levels that were used."""
+    records: dict[str, dict[str, Any]] = {}
+    for name, nuisance in solution.nuisances.items():
+        values, sigmas, held = (item.reshape(-1).tolist() for item in (nuisance.value, nuisance.sigma, nuisance.held))
+        for index, (value, sigma, is_held) in enumerate(zip(values, sigmas, held, strict=True)):
+            key = name if len(values) == 1 else f"{name}[{index}]"
+            unit = nuisance.unit
+            if name == "joint_offset":
+                joint, unit = split_joint_column(joint_columns[index])
+                key = f"{JOINT_OFFSET}{joint}"
+            records[key] = {"value": value, "sigma": sigma, "unit": unit, "held": is_held}
+    for name, level in solution.noise.items():
+        records[f"noise {name}"] = {"value": float(level), "sigma": None, "unit": _noise_unit(name)}
+    return records
+
+
+def _noise_unit(name: str) -> str:
+    return name.rpartition("_")[2] if name.endswith(("_mm", "_rad", "_deg")) else "x nominal"
+
+
+def _transform(dst: str, src: str, matrix: torch.Tensor) -> RigidTransform:
+    return RigidTransform(dst, src, matrix.detach().cpu())
+
+
+def motions_of(
+    recording: Recording,
+    views: tuple[View, ...],
+    poses: MotionPoses,
+    choices: tuple[Choice, ...],
+    solution: Solution | None,
+) -> Motions:
+    """Used and rejected frames, each rejected one with its first reason."""
+    used = np.zeros(recording.n_frames, dtype=bool)
+    reasons = [JOINTS_UNKNOWN] * recording.n_frames
+    by_view = [reasons_for(view, poses, choice) for view, choice in zip(views, choices, strict=True)]
+    solved, solver_reasons = (None, None) if solution is None else used_motions(solution)
+    for motion, frame in enumerate(poses.frames):
+        missing = [view_reasons[motion] for view_reasons in by_view]
+        if all(missing):
+            reasons[frame] = missing[0]
+        elif solved is None or solver_reasons is None:
+            reasons[frame] = TOO_FEW
+        else:
+            used[frame], reasons[frame] = bool(solved[motion]), solver_reasons[motion]
+    return Motions(used, tuple(reasons), recording.frame_times_s)
+
+
+def residuals_px(
+    recording: Recording, poses: MotionPoses, solution: Solution, used: np.ndarray
+) -> dict[str, dict[str, Any]]:
+    """Residuals of each kind and camera in pixels, by frame."""
+    left = recording.stereo.left
+    arrays = residual_arrays(
+        solution, float(recording.stereo.right.focal), float(left.focal) if left is not None else 1.0
+    )
+    records = {}
+    for name, by_motion in arrays.items():
+        by_frame = np.full(recording.n_frames, np.nan)
+        by_frame[poses.frames] = by_motion
+        records[name] = residual_record(by_frame, "px", used)
+    return records
+
+
+def insufficient_data(config: CalibrationConfig, motions: Motions, why: str) -> CalibrationResult:
+    """The result of a recording with too few usable motions to solve; `why` tells how many there are."""
+    return CalibrationResult(
+        status="insufficient_data",
+        message=f"{STATUS_SENTENCES['insufficient_data']}: {why}",
+        method=config.solver.method,
+        camera_right_T_arm=None,
+        camera_left_T_camera_right=None,
+        covariance=None,
+        observability={"verdict": "unobservable", "sentences": [why]},
+        motions=motions,
+        config=config.to_dict(),
+    )
