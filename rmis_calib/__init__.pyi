@@ -1,3 +1,7 @@
+from .batches import BatchSettings as BatchSettings
+from .batches import batch as batch
+from .batches import compare as compare
+from .batches import pool as pool
 from .config import CalibrationConfig as CalibrationConfig
 from .config import load_config as load_config
 from .errors import CalibrationFailed as CalibrationFailed

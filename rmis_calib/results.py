@@ -89,6 +89,47 @@ class KinematicOffsets:
     rcm_mm: tuple[float, float]
 
 
+@dataclass(frozen=True, eq=False)
+class Information:
+    """What a recording tells of the transform and of the unknowns that all recordings of a set-up share, for pooling.
+
+    Attributes:
+        shared_names: the unknowns beside the transform (`radius`, `stereo_rotation[0]`, ...), s of them.
+        shared_prior_sigma: (s,) their priors, which `matrix` does not contain.
+        matrix: (6 + s, 6 + s) inverse covariance: rotation and translation as in the result's covariance, then their
+            deviations from the nominal values, in units as among the nuisances.
+        vector: (6 + s,) `matrix` times the estimate of these that the data alone give, the transform at the result's.
+    """
+
+    shared_names: tuple[str, ...]
+    shared_prior_sigma: np.ndarray
+    matrix: np.ndarray
+    vector: np.ndarray
+
+    def transform_covariance(self) -> np.ndarray:
+        """(6, 6) covariance of the transform that this and the priors give."""
+        full = self.matrix.copy()
+        full[np.diag_indices(len(full))] += np.concatenate([np.zeros(6), self.shared_prior_sigma**-2.0])
+        root = np.diagonal(full) ** -0.5
+        return (np.linalg.inv(full * root[:, None] * root) * root[:, None] * root)[:6, :6]
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "shared_names": list(self.shared_names),
+            "shared_prior_sigma": self.shared_prior_sigma.tolist(),
+            "matrix": self.matrix.tolist(),
+            "vector": self.vector.tolist(),
+        }
+
+    @classmethod
+    def from_dict(cls, raw: dict[str, Any]) -> "Information":
+        names = tuple(raw["shared_names"])
+        size = 6 + len(names)
+        sigma = np.asarray(raw["shared_prior_sigma"], dtype=float).reshape(len(names))
+        matrix = np.asarray(raw["matrix"], dtype=float).reshape(size, size)
+        return cls(names, sigma, matrix, np.asarray(raw["vector"], dtype=float).reshape(size))
+
+
 @dataclass(frozen=True)
 class CalibrationResult:
     """The hand-eye transform, how sure it is, and what it rests on.
@@ -110,6 +151,7 @@ class CalibrationResult:
         config: the resolved configuration.
         versions: of this package and of what it computes with.
         notes: what was guessed or mended while the input was read, a sentence each.
+        information: what pooling with other recordings needs beside the covariance; None for `paper` and `global`.
     """
 
     status: Status
@@ -126,6 +168,7 @@ class CalibrationResult:
     config: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str | None] = field(default_factory=lambda: package_versions())
     notes: tuple[str, ...] = ()
+    information: Information | None = None
     created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
 
     @property
@@ -184,6 +227,7 @@ class CalibrationResult:
             "config": self.config,
             "versions": self.versions,
             "notes": list(self.notes),
+            "information": None if self.information is None else self.information.to_dict(),
             "created": self.created,
         }
         return finite_or_none(record)
@@ -233,6 +277,7 @@ class CalibrationResult:
             config=raw["config"],
             versions=raw["versions"],
             notes=tuple(raw.get("notes") or ()),
+            information=None if raw.get("information") is None else Information.from_dict(raw["information"]),
             created=raw["created"],
         )
 

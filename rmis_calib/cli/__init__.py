@@ -17,6 +17,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "synth": ("Synth", "render a synthetic recording folder with its ground truth"),
     "detect": ("Detect", "find the instrument shaft in a recording, a video, a folder of images or an image"),
     "calibrate": ("Calibrate", "estimate camera_right_T_arm from a recording folder"),
+    "batch": ("Batch", "calibrate, or detect in, all recordings of a tree; resumes where it stopped"),
+    "compare": ("Compare", "pool results of one set-up, test whether they agree, name what does not fit"),
     "solve": ("Solve", "estimate camera_right_T_arm from an observations file (.npz)"),
     "evaluate": ("Evaluate", "measure a result against head points and against a truth file"),
 }

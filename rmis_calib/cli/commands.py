@@ -4,12 +4,20 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from pydantic import ValidationError
 
+from rmis_calib.batches.settings import BatchSettings
 from rmis_calib.cli import EXIT_OK
+from rmis_calib.cli.batch_console import (
+    batch_reporter,
+    conclude_batch,
+    conclude_comparison,
+    say_plan,
+    stopped_by_signal,
+)
 from rmis_calib.cli.console import ProgressCallback, conclude, print_table, progress_reporter, say
 from rmis_calib.cli.paths import beside, check_output_folder, setting_inputs
 from rmis_calib.cli.usage import parse_arguments
@@ -25,10 +33,6 @@ from rmis_calib.io.outputs import (
     is_json_of,
 )
 from rmis_calib.io.validation import first_finding
-
-if TYPE_CHECKING:
-    from rmis_calib.io import RecordingDescription
-    from rmis_calib.results import CalibrationResult
 
 Method = Literal["paper", "global", "joint"]
 Settings = Annotated[CalibrationConfig, tyro.conf.arg(name="")]
@@ -105,6 +109,8 @@ class Calibrate(_Estimates):
     """Replace OUT, if all of it was written by this program."""
     overlays: int = 12
     """Pictures drawn with detected and predicted contours, spread over the recording (-1: every frame)."""
+    overlay_video: bool = False
+    """Write OUT/overlay_right.mp4 (and _left) with detected and predicted contours, residuals and the verdict."""
 
     def run(self) -> int:
         recording_folder(self.recording)
@@ -113,9 +119,74 @@ class Calibrate(_Estimates):
         description = read_description(self.recording)
         out = self.out or beside(description.path, "_calibration")
         check_output_folder(out, [*description.inputs, *self.inputs()], self.overwrite)
+        from rmis_calib.report import calibrate_to_folder
+
         with progress_reporter() as progress:
-            result = calibrate_folder(description, out, self.resolved(), self.overwrite, self.overlays, progress)
+            result = calibrate_to_folder(
+                description,
+                out,
+                self.resolved(),
+                overwrite=self.overwrite,
+                overlays=self.overlays,
+                overlay_video=self.overlay_video,
+                progress=progress,
+            )
         return conclude(result, out / "report.html")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Batch(_Estimates):
+    """Calibrate, or detect in, every recording below a folder or in a manifest, side by side.
+
+    Writes OUT/NAME a recording, OUT/index.html, OUT/summary.csv, .parquet and .json. What is done already with the same
+    inputs and settings is passed over, so an interrupted batch goes on where it stopped. Exit code 0: every result
+    passed its own checks; 1: one did not, or a recording failed.
+    """
+
+    root: tyro.conf.Positional[Path]
+    """Folder that is searched for recordings; or a manifest: .txt (a path a line), .csv (recording, name, config, and
+    settings by their dotted names) or .yaml (recordings: [{recording, name, config}])."""
+    out: Path
+    """Folder to write."""
+    task: Literal["calibrate", "detect"] = "calibrate"
+    """What to do; detect takes plain videos and folders of pictures, too."""
+    dry_run: bool = False
+    """List what would be done, and why; write nothing."""
+    batch: Annotated[BatchSettings, tyro.conf.arg(name="")] = field(default_factory=BatchSettings)
+
+    def run(self) -> int:
+        self.inputs()
+        config = self.resolved()
+        if self.dry_run:
+            from rmis_calib.batches import plan
+
+            return say_plan(plan(self.root, self.out, config, self.task, self.batch))
+        from rmis_calib.batches import batch
+
+        with batch_reporter() as progress, stopped_by_signal(self.batch.watch) as stop:
+            summary = batch(
+                self.root, self.out, config, task=self.task, settings=self.batch, progress=progress, stop=stop
+            )
+        return conclude_batch(summary, self.out / "index.html")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compare:
+    """Compare results of one set-up: a pooled transform, whether they agree, which one does not fit, what drifts."""
+
+    results: tyro.conf.Positional[tuple[Path, ...]]
+    """Result files (result.json), or folders that hold one, in the order of their time."""
+
+    def run(self) -> int:
+        paths = [path / "result.json" if path.is_dir() else path for path in self.results]
+        for path in paths:
+            check_regular(path)
+        from rmis_calib.batches import compare
+        from rmis_calib.results import CalibrationResult
+
+        names = [str(path.parent if path.name == "result.json" else path) for path in paths]
+        results = [CalibrationResult.read(path) for path in paths]
+        return conclude_comparison(compare(results, names), dict(zip(names, results, strict=True)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -279,34 +350,17 @@ class Demo(_Estimates):
             check_output_folder(folder, self.inputs(), self.overwrite)
         from rmis_calib.io.description import read_description
         from rmis_calib.pipeline import evaluate
+        from rmis_calib.report import calibrate_to_folder
 
         with progress_reporter() as progress:
             render_recording(recording, "demo", self.motions, self.seed, self.overwrite, progress)
             description = read_description(recording)
-            result = calibrate_folder(description, calibration, self.resolved(), self.overwrite, 12, progress)
+            result = calibrate_to_folder(
+                description, calibration, self.resolved(), overwrite=self.overwrite, progress=progress
+            )
         code = conclude(result, calibration / "report.html")
         print_table("against the truth of the rendering", evaluate(result, recording).rows())
         return code
-
-
-def calibrate_folder(
-    source: "RecordingDescription",
-    out: Path,
-    config: CalibrationConfig,
-    overwrite: bool,
-    overlays: int,
-    progress: ProgressCallback,
-) -> "CalibrationResult":
-    """Calibrate a recording and write the answer, the report and the pictures as one folder, whole or not at all."""
-    from rmis_calib.io import atomic_directory, load_recording
-    from rmis_calib.pipeline import run_calibration
-    from rmis_calib.report import write_calibration_folder
-
-    recording = load_recording(source)
-    with atomic_directory(out, overwrite=overwrite) as folder:
-        run = run_calibration(recording, config, progress)
-        write_calibration_folder(folder, run, overlays)
-    return run.result
 
 
 def render_recording(

@@ -57,6 +57,18 @@ def load_yaml(path: str | Path, error: type[InputError] = ConfigError) -> dict[s
     return value
 
 
+def yaml_value(text: str) -> Any:
+    """A value as YAML files write it: `1e-3` a number, `[1, 2]` a list, `ends` a word.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    try:
+        return yaml.load(text, Loader=_Yaml12Loader)
+    except (yaml.YAMLError, ValueError, RecursionError) as problem:
+        raise ConfigError(where=repr(text[:80]), expected="a value as in YAML", found="something else") from problem
+
+
 def load_json(path: str | Path, error: type[InputError] = InputError) -> dict[str, Any]:
     """The mapping in a JSON file.
 

@@ -8,6 +8,11 @@ from rmis_calib.io._images import SUFFIXES, ImageReader
 from rmis_calib.io._video_file import VideoReader
 from rmis_calib.io.configs import check_regular
 
+VIDEO_SUFFIXES = (".mp4", ".m4v", ".mov", ".mkv", ".avi", ".webm", ".mpg", ".mpeg", ".ts", ".mts", ".wmv")
+"""Files in which a search takes a video for granted; others are opened when they are named."""
+PICTURE_SUFFIXES = SUFFIXES
+"""Files that count as pictures."""
+
 Reader = VideoReader | ImageReader | EyeReader
 """What decodes frames: `path`, `count`, `size` (height, width), `times_s`, `notes`, `read_all`, `read`."""
 
@@ -29,7 +34,7 @@ def open_reader(path: str | Path, expected_count: int | None = None) -> VideoRea
     if not path.is_dir():
         check_regular(path)
     try:
-        is_images = path.is_dir() or path.suffix.lower() in SUFFIXES
+        is_images = path.is_dir() or path.suffix.lower() in PICTURE_SUFFIXES
         return ImageReader(path) if is_images else VideoReader(path, expected_count)
     except PermissionError as error:
         raise VideoError(where=str(path), expected="a readable file", found=error.strerror) from error

@@ -14,7 +14,7 @@ from rmis_calib.pipeline.association import (
 from rmis_calib.pipeline.detection import View
 from rmis_calib.pipeline.observations import reasons_for
 from rmis_calib.pipeline.poses import MotionPoses
-from rmis_calib.results import JOINT_OFFSET, STATUS_SENTENCES, CalibrationResult, Motions, Status
+from rmis_calib.results import JOINT_OFFSET, STATUS_SENTENCES, CalibrationResult, Information, Motions, Status
 from rmis_calib.robot import split_joint_column
 from rmis_calib.solver import Solution, SolveStatus
 from rmis_calib.solver.observability import Observability
@@ -24,6 +24,8 @@ JOINTS_UNKNOWN = "the joint log does not cover this time"
 TOO_FEW = "usable, but there are too few"
 OTHER_TOOL_MM = 25.0
 """Distance of the shaft's end from its nominal place that no wrist explains: the metal of one is 5 to 20 mm long."""
+OF_ONE_RECORDING = ("clock", "joint_offset", "rcm_offset")
+"""Unknowns that another recording of the same set-up need not share."""
 TOO_FAR_SIGMA = 4.0
 """An unknown estimated this many prior sigmas from its nominal value says that the model does not fit the data."""
 
@@ -53,6 +55,7 @@ def make_result(
         motions=motions,
         residuals=residuals,
         nuisances=_nuisance_records(solution, joint_columns),
+        information=_information(solution),
         config=config.to_dict(),
     )
 
@@ -163,6 +166,35 @@ def _nuisance_records(solution: Solution, joint_columns: tuple[str, ...]) -> dic
     for name, level in solution.noise.items():
         records[f"noise {name}"] = {"value": float(level), "sigma": None, "unit": _noise_unit(name)}
     return records
+
+
+def _information(solution: Solution) -> Information | None:
+    """The information on the transform and on what recordings share, the other unknowns eliminated."""
+    posterior = solution.posterior
+    if posterior is None or not bool(torch.isfinite(posterior.information).all()):
+        return None
+    layout = posterior.layout
+    deviation, weight = (item.reshape(-1) for item in layout.prior(posterior.state))
+    names = [
+        name if part.stop - part.start == 1 else f"{name}[{index}]"
+        for name, part in layout.blocks.items()
+        for index in range(part.stop - part.start)
+    ]
+    is_kept = torch.tensor([name.partition("[")[0] not in OF_ONE_RECORDING for name in names])
+    kept, gone = is_kept.nonzero()[:, 0], (~is_kept).nonzero()[:, 0]
+    H = posterior.information.reshape(len(names), len(names)).cpu()
+    matrix = H[kept][:, kept] - H[kept][:, gone] @ torch.linalg.solve(H[gone][:, gone], H[gone][:, kept])
+    shared = kept[6:]
+    # The posterior's information, priors included, is divided by what the residuals exceed the noise by.
+    excess = float(solution.chi2_per_dof.clamp_min(1.0))
+    prior = torch.cat([weight.new_zeros(6), weight[shared] / excess]).cpu()
+    away = torch.cat([weight.new_zeros(6), deviation[shared]]).cpu()
+    return Information(
+        shared_names=tuple(names[index] for index in shared.tolist()),
+        shared_prior_sigma=weight[shared].rsqrt().cpu().numpy(),
+        matrix=(matrix - torch.diag(prior)).numpy(),
+        vector=(matrix @ away).numpy(),
+    )
 
 
 def _noise_unit(name: str) -> str:

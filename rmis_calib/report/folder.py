@@ -6,13 +6,17 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from rmis_calib.config import CalibrationConfig
+from rmis_calib.io import RecordingDescription, atomic_directory, load_recording
 from rmis_calib.io.atomic import write_yaml
-from rmis_calib.pipeline.detection import DetectionTable, View
+from rmis_calib.pipeline.calibration import run_calibration
+from rmis_calib.pipeline.detection import DetectionTable, Progress, View, no_progress
 from rmis_calib.pipeline.run import CalibrationRun
 from rmis_calib.report.detection_pictures import write_picture
+from rmis_calib.report.overlay_video import write_overlay_videos
 from rmis_calib.report.page import write_report
 from rmis_calib.report.pictures import overlays, spread
-from rmis_calib.results import finite_or_none
+from rmis_calib.results import CalibrationResult, finite_or_none
 from rmis_calib.vision import FrameReason
 
 REPORT_PICTURES = 12
@@ -25,13 +29,46 @@ LINE_COLUMNS = (
 )  # fmt: skip
 
 
-def write_calibration_folder(folder: Path, run: CalibrationRun, count: int) -> None:
-    """result.json, config.yaml, observations.npz, overlays/*.jpg and report.html.
+def calibrate_to_folder(
+    source: RecordingDescription,
+    out: Path,
+    config: CalibrationConfig,
+    *,
+    overwrite: bool = False,
+    overlays: int = REPORT_PICTURES,
+    overlay_video: bool = False,
+    progress: Progress = no_progress,
+) -> CalibrationResult:
+    """Calibrate a recording and write the answer, the report and the pictures as one folder, whole or not at all.
+
+    Args:
+        source: from `read_description`.
+        out: folder to write.
+        config: of the calibration.
+        overwrite: replace a folder that this program wrote.
+        overlays: pictures a camera; -1 for every motion.
+        overlay_video: write a video a camera, too.
+        progress: called with (stage, done, total).
+
+    Raises:
+        InputError, FileError: the recording breaks its format.
+        OutputError: the folder may not be written, or cannot.
+    """
+    recording = load_recording(source)
+    with atomic_directory(out, overwrite=overwrite) as folder:
+        run = run_calibration(recording, config, progress)
+        write_calibration_folder(folder, run, overlays, overlay_video)
+    return run.result
+
+
+def write_calibration_folder(folder: Path, run: CalibrationRun, count: int, video: bool = False) -> None:
+    """result.json, config.yaml, observations.npz, overlays/*.jpg, report.html and, where asked for, overlay_*.mp4.
 
     Args:
         folder: existing folder.
         run: what to write.
         count: pictures per camera in `overlays`; -1 for every motion.
+        video: whether to write a video a camera.
     """
     run.result.write(folder / "result.json")
     write_yaml(folder / "config.yaml", finite_or_none(run.result.config))
@@ -55,6 +92,8 @@ def write_calibration_folder(folder: Path, run: CalibrationRun, count: int) -> N
         title=f"Hand-eye calibration: {name}",
         source=name,
     )
+    if video:
+        write_overlay_videos(folder, run)
 
 
 def write_lines(folder: Path, table: DetectionTable) -> None:

@@ -19,9 +19,12 @@ _AT_ONCE = 16
 """Frames read in one call: opening and seeking a video for each takes longer than drawing, and all may not fit."""
 
 
-def overlays(run: CalibrationRun, motions: np.ndarray) -> Iterator[Overlay]:
-    """Pictures of these motions (increasing numbers) in each view; each video is read once, a few frames at a time."""
+def overlays(run: CalibrationRun, motions: np.ndarray, side: str | None = None) -> Iterator[Overlay]:
+    """Pictures of these motions (increasing numbers) in each view, or in that of one side; each video is read once, a
+    few frames at a time."""
     for view in run.views:
+        if side not in (None, view.side):
+            continue
         contours, ends = run.predicted_contours(view), run.predicted_ends(view)
         for start in range(0, len(motions), _AT_ONCE):
             part = motions[start : start + _AT_ONCE].tolist()

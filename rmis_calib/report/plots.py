@@ -151,14 +151,19 @@ def _padded(limits: tuple[float, float]) -> tuple[float, float]:
 
 def _figure(size_inches: tuple[float, float]) -> tuple[Figure, Axes]:
     figure = Figure(figsize=size_inches, layout="constrained", facecolor="none")
-    axes = figure.add_subplot(facecolor="none")
+    axes = figure.add_subplot()
+    _style(axes)
+    return figure, axes
+
+
+def _style(axes: Axes) -> None:
+    axes.set_facecolor("none")
     axes.set_axisbelow(True)
     axes.spines[["top", "right", "left"]].set_visible(False)
     axes.spines["bottom"].set(color=_QUIET, linewidth=0.8)
     axes.tick_params(colors=_QUIET, labelsize=9, length=0, pad=4)
     axes.xaxis.label.set(color=_QUIET, size=9)
     axes.yaxis.label.set(color=_QUIET, size=9)
-    return figure, axes
 
 
 def _svg(figure: Figure, description: str) -> Markup:
@@ -185,3 +190,47 @@ def _svg(figure: Figure, description: str) -> Markup:
     label = escape(description, quote=True)
     head = re.sub(r'\s(?:width|height)="[^"]*"', "", text[: text.index(">")])
     return Markup(f'{head} role="img" aria-label="{label}"{text[text.index(">") :]}')
+
+
+def plot_repeatability(
+    deviation: Float[np.ndarray, "n 6"],
+    sigma: Float[np.ndarray, "n 6"],
+    kept: Bool[np.ndarray, " n"],
+    changes: tuple[int, ...],
+    name: str,
+) -> Markup:
+    """Results of one set-up about their pooled transform, axis by axis, each with its 1-sigma bar.
+
+    Args:
+        deviation: of each result: rotation vector in rad, translation in mm.
+        sigma: of each result; the same units.
+        kept: whether a result counts; the others are hollow.
+        changes: numbers of the results before which the transform changes: upright lines.
+        name: what is drawn, for readers who cannot see it.
+    """
+    figure = Figure(figsize=(8.6, 4.0), layout="constrained", facecolor="none")
+    panels = figure.subplots(2, 3, sharex=True)
+    place = np.arange(len(deviation))
+    for axis, axes in enumerate(panels.flat):
+        to_unit, unit = (180.0 / np.pi, "deg") if axis < 3 else (1.0, "mm")
+        values, bars = deviation[:, axis] * to_unit, sigma[:, axis] * to_unit
+        _style(axes)
+        axes.axhline(0.0, color=_QUIET, linewidth=0.8)
+        for change in changes:
+            axes.axvline(change - 0.5, color=_INK, linewidth=0.8, linestyle=(0, (4, 3)))
+        for shown, face in ((kept, _DATA["right"]), (~kept, _SURFACE)):
+            axes.errorbar(
+                place[shown], values[shown], yerr=bars[shown], fmt="o", markersize=3.5, color=_DATA["right"],
+                markerfacecolor=face, elinewidth=0.9, capsize=0,
+            )  # fmt: skip
+        scatter = float(np.sqrt(np.mean(values[kept] ** 2))) if kept.any() else math.nan
+        predicted = float(np.sqrt(np.mean(bars[kept] ** 2))) if kept.any() else math.nan
+        what = ("about x", "about y", "about z", "along x", "along y", "along z")[axis]
+        axes.set_title(f"{what}: scatter {scatter:.2g}, predicted {predicted:.2g} {unit}", size=9, color=_INK)
+        axes.set(xlim=(-0.6, len(deviation) - 0.4))
+        axes.xaxis.set_major_locator(_whole_numbers())
+        if axis >= 3:
+            axes.set_xlabel("recording")
+        if axis % 3 == 0:
+            axes.set_ylabel(unit)
+    return _svg(figure, name)

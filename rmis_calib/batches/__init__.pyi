@@ -1,0 +1,10 @@
+from .pooling import Pooled as Pooled
+from .pooling import pool as pool
+from .run import Progress as Progress
+from .run import batch as batch
+from .run import plan as plan
+from .settings import BatchSettings as BatchSettings
+from .setups import SetupComparison as SetupComparison
+from .setups import compare as compare
+from .summary import BatchSummary as BatchSummary
+from .task import JobRecord as JobRecord

@@ -1,0 +1,56 @@
+"""Who works on an output folder: one batch at a time, and a dead one does not count.
+
+The lock is the kernel's (flock, through filelock), which lets go when its holder dies, however it dies. Beside it
+stands who holds it, for people.
+"""
+
+import json
+import os
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from rmis_calib.errors import OutputError
+
+LOCK, HOLDER = ".rmis-calib-batch.lock", ".rmis-calib-batch.holder.json"
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[str | None]:
+    """Hold the lock of an output folder; gives who held it before and died with it, in words.
+
+    Raises:
+        OutputError: another batch is at work there; says which. Or the folder cannot be written.
+    """
+    lock = FileLock(folder / LOCK, timeout=0)
+    try:
+        lock.acquire()
+    except Timeout as error:
+        holder = _holder(folder) or "another batch"
+        expected = "an output folder that nobody is at work in"
+        raise OutputError(where=str(folder), expected=expected, found=holder) from error
+    except OSError as error:
+        expected = "a folder that can be written and locked"
+        raise OutputError(where=str(folder), expected=expected, found=error.strerror) from error
+    try:
+        dead = _holder(folder)
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        holder = {"host": socket.gethostname(), "pid": os.getpid(), "since": now}
+        (folder / HOLDER).write_text(json.dumps(holder) + "\n", encoding="utf-8")
+        yield dead
+    finally:
+        (folder / HOLDER).unlink(missing_ok=True)
+        lock.release()
+
+
+def _holder(folder: Path) -> str | None:
+    """Who says to be at work; None where nobody does."""
+    try:
+        raw = json.loads((folder / HOLDER).read_text(encoding="utf-8"))
+        return f"a batch on {raw['host']}, process {raw['pid']}, since {raw['since']}"
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
