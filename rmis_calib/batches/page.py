@@ -72,7 +72,7 @@ class PageSetup:
 
 
 HEADINGS = (
-    ("predicted error, mm", "1 sigma where the instrument works"),
+    ("error, mm", "predicted, 1 sigma, where the instrument works"),
     ("rotation, deg", "1 sigma, root of the trace"),
     ("translation, mm", "1 sigma, root of the trace"),
     ("used", "motions that entered the estimate"),

@@ -119,11 +119,13 @@ def batch(
     with locked(out) as dead, _log_file(out / BATCH_LOG) as log:
         if dead is not None:
             log.warning("taken over from %s, which is gone", dead)
+        now = first
         while True:
-            summary = _one_round(root, out, config, task, settings, progress, stop, log)
+            summary = _one_round(root, out, config, task, settings, now, progress, stop, log)
             if not settings.watch or stop():
                 return summary
             _sleep(settings.poll_s, stop)
+            now = plan(root, out, config, task, settings)
 
 
 def plan(root: Path, out: Path, config: CalibrationConfig, task: Task, settings: BatchSettings) -> Plan:
@@ -180,12 +182,12 @@ def _one_round(
     config: CalibrationConfig,
     task: Task,
     settings: BatchSettings,
+    now: Plan,
     progress: Watcher,
     stop: Callable[[], bool],
     log: logging.Logger,
 ) -> BatchSummary:
     """All work that there is now."""
-    now = plan(root, out, config, task, settings)
     orders = [order for order, _ in now.orders]
     for order in orders:
         _clear_remains(order.target)
@@ -220,9 +222,12 @@ def _work(
     """Records of the jobs, as they end."""
     if not orders:
         return
-    workers = min(settings.workers or cores(), len(orders))
+    asked = settings.workers or cores()
+    workers = min(asked, len(orders))
     limits = Limits(
-        threads=max(1, cores() // workers),
+        # Not by the jobs that are left: sums over threads round differently, and a batch that was resumed must come to
+        # the same numbers.
+        threads=max(1, cores() // asked),
         memory_bytes=_memory_of_each(workers, settings.memory_gb),
         timeout_s=None if settings.timeout_min is None else 60.0 * settings.timeout_min,
         retries=settings.retries,

@@ -171,7 +171,7 @@ def _attempt(order: Order, folder: Path, log: "StageLog") -> JobRecord:
     except OutputError:
         raise
     except Exception as error:
-        failure, why = _classified(error)
+        failure, why = _classified(error, order.job.source)
         if failure == "bug":
             log.note("traceback", text=traceback.format_exc())
         _empty(folder)
@@ -236,7 +236,7 @@ def row_of_result(result: "CalibrationResult") -> dict[str, Any]:
         "working_point_sigma_mm": result.observability.get("working_point_sigma_mm"),
         "motions": len(result.motions.used),
         "motions_used": int(result.motions.used.sum()),
-        "clock_s": clock["value"],
+        "clock_s": None if clock["value"] is None else round(clock["value"], 9),  # rounding is no offset
         "clock_sigma_s": clock["sigma"],
         "notes": list(result.notes),
     }
@@ -297,8 +297,8 @@ class StageLog:
         self._lines.append(json.dumps({"time": stamp, "event": event, **values}, ensure_ascii=False))
 
 
-def _classified(error: Exception) -> tuple[Failure, str]:
-    text = _one_line(error)
+def _classified(error: Exception, source: Path) -> tuple[Failure, str]:
+    text = _one_line(error, source)
     if isinstance(error, MemoryError) or any(words in str(error).lower() for words in _OUT_OF_MEMORY):
         return "memory", f"it needs more memory than there is for a worker ({text[:200]})"
     if isinstance(error, RmisCalibError):
@@ -306,8 +306,10 @@ def _classified(error: Exception) -> tuple[Failure, str]:
     return "bug", f"{type(error).__name__}: {text} (a bug; {LOG} has the traceback)"
 
 
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+def _one_line(error: BaseException, source: Path | None = None) -> str:
+    """What an error says; files of the recording by their place in it."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if source is None else text.replace(f"{source}/", "")
 
 
 def _empty(folder: Path) -> None:

@@ -79,7 +79,7 @@ class _Worker:
 
     def give(self, index: int, task: Any, attempt: int) -> None:
         self.task, self.attempt, self.since_s = index, attempt, time.monotonic()
-        self.connection.send(task)
+        self.connection.send((task,))
 
     def stop_if_late(self) -> None:
         limit_s = self._limits.timeout_s
@@ -226,12 +226,12 @@ def _work(connection: Connection, function: Callable[[Any, Report], Any], limits
     torch.set_num_threads(limits.threads)
     while True:
         try:
-            task = connection.recv()
+            given = connection.recv()
         except (EOFError, OSError):
             return
-        if task is None:
+        if given is None:
             return
-        value = function(task, _Reporter(connection))
+        value = function(*given, _Reporter(connection))
         connection.send(("finished", value))
 
 

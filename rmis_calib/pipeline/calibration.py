@@ -75,9 +75,12 @@ def run_calibration(
     run = _solve_surest(recording, config, views, poses, attempts, progress)
     run = _choose_again(run, _without_joint_offsets(config), several, progress)
     run = _with_joint_offsets(run, config, progress)
+    progress("checking", 0, 1)
     run = with_misfit_named(run, config)
     run = run.with_notes((*recording.notes, *notes))
-    return with_next_motions(run, config)
+    run = with_next_motions(run, config)
+    progress("checking", 1, 1)
+    return run
 
 
 def _detect(

@@ -208,16 +208,16 @@ def plot_repeatability(
         changes: numbers of the results before which the transform changes: upright lines.
         name: what is drawn, for readers who cannot see it.
     """
-    figure = Figure(figsize=(8.6, 4.0), layout="constrained", facecolor="none")
+    figure = Figure(figsize=(8.6, 4.4), layout="constrained", facecolor="none")
     panels = figure.subplots(2, 3, sharex=True)
-    place = np.arange(len(deviation))
+    place = np.arange(1, len(deviation) + 1)
     for axis, axes in enumerate(panels.flat):
         to_unit, unit = (180.0 / np.pi, "deg") if axis < 3 else (1.0, "mm")
         values, bars = deviation[:, axis] * to_unit, sigma[:, axis] * to_unit
         _style(axes)
         axes.axhline(0.0, color=_QUIET, linewidth=0.8)
         for change in changes:
-            axes.axvline(change - 0.5, color=_INK, linewidth=0.8, linestyle=(0, (4, 3)))
+            axes.axvline(change + 0.5, color=_INK, linewidth=0.8, linestyle=(0, (4, 3)))
         for shown, face in ((kept, _DATA["right"]), (~kept, _SURFACE)):
             axes.errorbar(
                 place[shown], values[shown], yerr=bars[shown], fmt="o", markersize=3.5, color=_DATA["right"],
@@ -226,8 +226,9 @@ def plot_repeatability(
         scatter = float(np.sqrt(np.mean(values[kept] ** 2))) if kept.any() else math.nan
         predicted = float(np.sqrt(np.mean(bars[kept] ** 2))) if kept.any() else math.nan
         what = ("about x", "about y", "about z", "along x", "along y", "along z")[axis]
-        axes.set_title(f"{what}: scatter {scatter:.2g}, predicted {predicted:.2g} {unit}", size=9, color=_INK)
-        axes.set(xlim=(-0.6, len(deviation) - 0.4))
+        title = f"{what}\nscatter {scatter:.2g}, predicted {predicted:.2g} {unit}"
+        axes.set_title(title, size=9, color=_INK, loc="left")
+        axes.set(xlim=(0.4, len(deviation) + 0.6))
         axes.xaxis.set_major_locator(_whole_numbers())
         if axis >= 3:
             axes.set_xlabel("recording")
