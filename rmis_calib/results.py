@@ -151,6 +151,9 @@ class CalibrationResult:
         config: the resolved configuration.
         versions: of this package and of what it computes with.
         notes: what was guessed or mended while the input was read, a sentence each.
+        consistency: whether parts of the data agree: groups of neighbouring motions left out in turn (`inflation` of
+            sigma, `groups` with their shift of the answer), and two halves against each other; None for `paper` and
+            `global`, and for few motions.
         information: what pooling with other recordings needs beside the covariance; None for `paper` and `global`.
     """
 
@@ -168,6 +171,7 @@ class CalibrationResult:
     config: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str | None] = field(default_factory=lambda: package_versions())
     notes: tuple[str, ...] = ()
+    consistency: dict[str, Any] | None = None
     information: Information | None = None
     created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
 
@@ -227,6 +231,7 @@ class CalibrationResult:
             "config": self.config,
             "versions": self.versions,
             "notes": list(self.notes),
+            "consistency": self.consistency,
             "information": None if self.information is None else self.information.to_dict(),
             "created": self.created,
         }
@@ -277,6 +282,7 @@ class CalibrationResult:
             config=raw["config"],
             versions=raw["versions"],
             notes=tuple(raw.get("notes") or ()),
+            consistency=raw.get("consistency"),
             information=None if raw.get("information") is None else Information.from_dict(raw["information"]),
             created=raw["created"],
         )

@@ -231,7 +231,7 @@ def _work(connection: Connection, function: Callable[[Any, Report], Any], limits
             return
         if given is None:
             return
-        value = function(*given, _Reporter(connection))
+        value = function(given[0], _Reporter(connection))
         connection.send(("finished", value))
 
 

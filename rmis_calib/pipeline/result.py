@@ -18,12 +18,15 @@ from rmis_calib.results import JOINT_OFFSET, STATUS_SENTENCES, CalibrationResult
 from rmis_calib.robot import split_joint_column
 from rmis_calib.solver import Solution, SolveStatus
 from rmis_calib.solver.observability import Observability
+from rmis_calib.solver.solution import CHANGED, GroupCheck
 from rmis_calib.solver.status import MotionReason
 
 JOINTS_UNKNOWN = "the joint log does not cover this time"
 TOO_FEW = "usable, but there are too few"
 OTHER_TOOL_MM = 25.0
 """Distance of the shaft's end from its nominal place that no wrist explains: the metal of one is 5 to 20 mm long."""
+WORTH_SAYING = 1.25
+"""Growth of sigma by disagreeing groups from which it is said."""
 OF_ONE_RECORDING = ("clock", "joint_offset", "rcm_offset")
 """Unknowns that another recording of the same set-up need not share."""
 TOO_FAR_SIGMA = 4.0
@@ -41,6 +44,7 @@ def make_result(
     """The result of one solve (no trial batch); `joint_columns` name its joint offsets, `notes` join what is said of
     the data."""
     status, message = judge(solution)
+    consistency = consistency_record(solution)
     finite = bool(torch.isfinite(solution.camera_right_T_arm).all())
     covariance = solution.covariance.cpu().numpy()
     stereo = solution.camera_left_T_camera_right
@@ -51,10 +55,13 @@ def make_result(
         camera_right_T_arm=_transform("camera_right", "arm", solution.camera_right_T_arm) if finite else None,
         camera_left_T_camera_right=None if stereo is None else _transform("camera_left", "camera_right", stereo),
         covariance=covariance if np.isfinite(covariance).all() else None,
-        observability=observability_record(solution.observability.describe(), (*notes, *_about_tool(solution))),
+        observability=observability_record(
+            solution.observability.describe(), (*notes, *_about_tool(solution), *about_groups(consistency))
+        ),
         motions=motions,
         residuals=residuals,
         nuisances=_nuisance_records(solution, joint_columns),
+        consistency=consistency,
         information=_information(solution),
         config=config.to_dict(),
     )
@@ -85,6 +92,8 @@ def judge(solution: Solution) -> tuple[Status, str]:
         return "solver_failed", f"{why}; {strange}" if strange else why
     if strange:
         return "weak", f"{STATUS_SENTENCES['weak']}: {strange}"
+    if solution.groups is not None and bool(solution.groups.contradicts):
+        return "weak", f"Parts of the data contradict each other: {_contradiction(solution.groups)}"
     names: dict[str, Status] = {"trustworthy": "ok", "weak": "weak", "unobservable": "unobservable"}
     name = names[observability.verdict.value]
     return name, f"{STATUS_SENTENCES[name]}: {observability.sentence}"
@@ -166,6 +175,82 @@ def _nuisance_records(solution: Solution, joint_columns: tuple[str, ...]) -> dic
     for name, level in solution.noise.items():
         records[f"noise {name}"] = {"value": float(level), "sigma": None, "unit": _noise_unit(name)}
     return records
+
+
+def consistency_record(solution: Solution) -> dict[str, Any] | None:
+    """Groups of neighbouring motions and halves against each other, as plain values; None without groups."""
+    groups = solution.groups
+    if groups is None or groups.count == 0 or bool((groups.group < 0).all()):
+        return None
+    shifts, numbers = groups.shift[0].cpu(), groups.group.reshape(-1).cpu()
+    return {
+        "inflation": float(groups.inflation),
+        "group_by_motion": numbers.tolist(),
+        "groups": [
+            {
+                "motions": int((numbers == k).sum()),
+                "rotation_deg": float(torch.rad2deg(shifts[k, :3].norm())),
+                "translation_mm": float(shifts[k, 3:].norm()),
+                "sigmas": float(groups.sigmas[0, k]),
+            }
+            for k in range(groups.count)
+        ],
+        "halves": {
+            "rotation_deg": float(torch.rad2deg(groups.halves[0, :3].norm())),
+            "translation_mm": float(groups.halves[0, 3:].norm()),
+            "sigmas": float(groups.halves_sigmas),
+        },
+        "change": {
+            "before_motion": int(groups.change_at),
+            "rotation_deg": float(torch.rad2deg(groups.change[0, :3].norm())),
+            "translation_mm": float(groups.change[0, 3:].norm()),
+            "sigmas": float(groups.change_sigmas),
+        },
+    }
+
+
+def about_groups(consistency: dict[str, Any] | None) -> tuple[str, ...]:
+    """Whether parts of the data disagree by more than noise, in words."""
+    if consistency is None or consistency["inflation"] < WORTH_SAYING:
+        return ()
+    worst = max(range(len(consistency["groups"])), key=lambda k: consistency["groups"][k]["sigmas"])
+    group = consistency["groups"][worst]
+    motions = [i for i, k in enumerate(consistency["group_by_motion"]) if k == worst]
+    where, grown = ranges_in_words(motions), consistency["inflation"]
+    return (
+        "Groups of neighbouring motions disagree by more than noise explains, so every sigma counts "
+        f"{grown:.1f} times. Most of all the {group['motions']} motions {where}: without them the answer moves by "
+        f"{group['rotation_deg']:.2g} deg, {group['translation_mm']:.2g} mm.",
+    )
+
+
+def ranges_in_words(numbers: list[int], most: int = 4) -> str:
+    """Increasing numbers as ranges: `3, 7 to 12`; the rest of many ranges is left out."""
+    ranges: list[tuple[int, int]] = []
+    for number in numbers:
+        if ranges and number == ranges[-1][1] + 1:
+            ranges[-1] = (ranges[-1][0], number)
+        else:
+            ranges.append((number, number))
+    words = [f"{a}" if a == b else f"{a} to {b}" for a, b in ranges]
+    return ", ".join(words[:most]) + (", ..." if len(words) > most else "")
+
+
+def _contradiction(groups: GroupCheck) -> str:
+    """Which parts of the data tell of different transforms."""
+    if float(groups.change_sigmas) > CHANGED:
+        return (
+            f"what comes before motion {int(groups.change_at)} and after differs by {_apart(groups.change[0])}, "
+            "beyond its sigmas: did the camera, a trocar or an arm's base move there?"
+        )
+    return (
+        f"two halves of the motions, far from each other in joint space, disagree by {_apart(groups.halves[0])}, "
+        "beyond their sigmas: what the model leaves out (lens, focal length, an arm's base, joints) is more than noise"
+    )
+
+
+def _apart(gap: torch.Tensor) -> str:
+    return f"{float(torch.rad2deg(gap[:3].norm())):.2g} deg, {float(gap[3:].norm()):.2g} mm"
 
 
 def _information(solution: Solution) -> Information | None:

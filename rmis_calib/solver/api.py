@@ -52,7 +52,8 @@ def solve(
         differentiable: whether `camera_right_T_arm`, `camera_left_T_camera_right` and `covariance` pass gradients to
             the problem's tensors. They are those of the whole solve, by implicit differentiation at the answer
             (estimate/on_graph.py), noise levels and bias correction included; held are the choices that jump: which
-            measurements are outliers, which basin was taken, which motions are kept. All motions are on the graph at
+            measurements are outliers, which basin was taken, which motions are kept, and by how much the covariance
+            grows as groups of motions disagree. All motions are on the graph at
             once: about 100 kB each in `joint`. Gradients of trials that did not converge mean nothing.
 
     Raises:
@@ -185,6 +186,8 @@ def _spread(solution: Solution, index: Int[Tensor, " k"], n: int) -> Solution:
     names = ("residual_lines", "residual_ends", "residual_heads", "distance")
     values: dict[str, Any] = {name: spread(getattr(solution, name), torch.nan) for name in names}
     values["residual_own"] = {name: spread(value, torch.nan) for name, value in solution.residual_own.items()}
+    if solution.groups is not None:
+        values["groups"] = replace(solution.groups, group=spread(solution.groups.group, -1))
     return replace(solution, reason=spread(solution.reason, int(MotionReason.THINNED)), **values)
 
 
@@ -211,7 +214,7 @@ def _shaped(solution: Solution, batch: torch.Size) -> Solution:
     def shaped(value: Tensor) -> Tensor:
         return value.clone().reshape((*batch, *value.shape[1:]))
 
-    flat = ("observability", "posterior", "history")
+    flat = ("observability", "posterior", "groups", "history")
     return replace(
         solution,
         **{name: map_tensors(item, torch.clone if name in flat else shaped) for name, item in vars(solution).items()},

@@ -163,5 +163,8 @@ class SolverSettings:
     """Keep only this many most informative motions (D-optimal); the loss in information is stated."""
     chunk: Annotated[int, Field(ge=256)] = 4096
     """Motions (times trials) that are in work at once: bounds memory."""
+    groups: Annotated[int, Field(ge=0, le=32)] = 8
+    """Groups of neighbouring motions that are left out in turn; the covariance of `joint` grows where the answer moves
+    by more than noise allows. 0: no such check."""
     seed: int = 0
     """Seed of the simulations of the bias correction."""

@@ -57,6 +57,51 @@ class Posterior:
     information: Float[Tensor, "b p p"]
 
 
+HALVES_APART = 4.49
+"""Distance of two halves in their sigmas, the 3-sigma bound of 6 unknowns, beyond which they contradict each other."""
+CHANGED = 5.5
+"""Distance of before and after in their sigmas that chance makes in fewer than 3 of 10,000 recordings of 8 blocks."""
+
+
+@dataclass(frozen=True)
+class GroupCheck:
+    """How the answer depends on groups of neighbouring motions, per trial.
+
+    Attributes:
+        group: number of each motion's group; -1 for motions that were not used. All -1: too few for groups.
+        count: number of groups.
+        shift: of the transform when a group is left out, [rotation vector, translation], rad and mm.
+        sigmas: length of each shift in the sigmas that noise alone would give it; 6 degrees of freedom.
+        growth: factor on the variances of the transform, 1 or more, by direction: covariance -> T covariance T^T.
+        inflation: root of the mean factor on the variance.
+        halves: difference of the answers of two halves of the motions, on either side of where they spread most.
+        halves_sigmas: the same in their grown sigmas; 6 degrees of freedom.
+        change: the clearest difference between what comes before and after some motion; change_sigmas: in sigmas;
+            change_at: that motion, the first of a block.
+    """
+
+    group: Int[Tensor, "b n"]
+    count: int
+    shift: Float[Tensor, "b k 6"]
+    sigmas: Float[Tensor, "b k"]
+    growth: Float[Tensor, "b 6 6"]
+    inflation: Float[Tensor, " b"]
+    halves: Float[Tensor, "b 6"]
+    halves_sigmas: Float[Tensor, " b"]
+    change: Float[Tensor, "b 6"]
+    change_sigmas: Float[Tensor, " b"]
+    change_at: Int[Tensor, " b"]
+
+    @property
+    def contradicts(self) -> Bool[Tensor, " b"]:
+        """Whether parts of the data tell of different transforms."""
+        return (self.halves_sigmas > HALVES_APART) | (self.change_sigmas > CHANGED)
+
+    def grown(self, covariance: Float[Tensor, "b 6 6"]) -> Float[Tensor, "b 6 6"]:
+        """The covariance that says how far parts of the data are apart."""
+        return self.growth @ covariance @ self.growth.mT
+
+
 @dataclass(frozen=True)
 class Solution:
     """Estimates for every trial of the batch.
@@ -81,6 +126,7 @@ class Solution:
         bias: correction that was subtracted from (rotation, translation); zero when none.
         observability: what the data can see, flat over trials; its `describe(trial)` puts one trial into words.
         posterior: what further motions would add to (assess/information.py); None for methods that estimate no noise.
+        groups: what leaving out groups of neighbouring motions says, flat over trials; None for `paper` and `global`.
         history: cost of accepted iterates of the refinement.
         information_kept: part of the information (per parameter, geometric mean) that thinning kept; 1 without.
     """
@@ -104,6 +150,7 @@ class Solution:
     observability: ObservabilityTensors
     residual_own: dict[str, Float[Tensor, "*batch n"]] = field(default_factory=dict)
     posterior: Posterior | None = None
+    groups: GroupCheck | None = None
     history: tuple[Float[Tensor, "..."], ...] = ()
     information_kept: float = 1.0
 
@@ -121,6 +168,8 @@ class Solution:
     def verdict(self) -> Int[Tensor, "*batch"]:
         """0 trustworthy, 1 weak, 2 unobservable; a solve that did not converge is never better than unobservable."""
         verdict = self.observability.verdict.view_as(self.status)
+        if self.groups is not None:
+            verdict = torch.where(self.groups.contradicts.view_as(verdict), verdict.clamp_min(1), verdict)
         return torch.where(self.converged, verdict, 2)
 
     @property

@@ -20,14 +20,14 @@ CHANGES = {
     "end_xy": 3e-4, "head_xy": 3e-4, "radius_mm": 1e-2,
 }  # fmt: skip
 """What is differentiated by, and how large a change of it is as large as noise."""
-PLAIN = SolverSettings(robust="off", bias_correction=False, noise=NoiseSettings(estimate="never"))
+PLAIN = SolverSettings(robust="off", bias_correction=False, noise=NoiseSettings(estimate="never"), groups=0)
 CASES = {
     "paper": ("paper", SolverSettings()),
     "global": ("global", SolverSettings()),
     "joint, noise known": ("joint", PLAIN),
     "joint, bias": ("joint", replace(PLAIN, bias_correction=True)),
     "joint, noise estimated": ("joint", replace(PLAIN, noise=NoiseSettings(estimate="always"))),
-    "joint, everything": ("joint", SolverSettings(noise=NoiseSettings(estimate="always"))),
+    "joint, everything": ("joint", SolverSettings(noise=NoiseSettings(estimate="always"), groups=0)),
     "joint, thinned": ("joint", replace(PLAIN, thin_to=30)),
 }
 

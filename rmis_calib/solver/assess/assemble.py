@@ -8,6 +8,7 @@ from torch import Tensor
 
 from rmis_calib.geometry.rigid import rigid_from_rotation_translation
 from rmis_calib.geometry.rotations import matrix_to_rotvec
+from rmis_calib.solver.assess.groups import check_groups
 from rmis_calib.solver.assess.observability import assess, detect_degeneracies
 from rmis_calib.solver.estimate.map_estimate import MapEstimate
 from rmis_calib.solver.estimate.multistart import cheirality
@@ -105,6 +106,8 @@ def joint_solution(fit: MapEstimate, settings: SolverSettings, alternative: Alte
     C = fit.covariance[:, :6, :6]
     status, reason, excess = _judge(fit)
     C = C * excess.clamp_min(1.0)[:, None, None]  # too small noise levels would make sigma too small (Birge 1932)
+    groups = check_groups(fit, settings.groups)
+    C = groups.grown(C)
     if alternative is not None:
         C = _mixed(C, state.R, state.t, alternative)
     distance = (fit.distance2 / measured.rows_ok.sum(0).clamp_min(1)).sqrt()
@@ -125,6 +128,7 @@ def joint_solution(fit: MapEstimate, settings: SolverSettings, alternative: Alte
         noise={name: getattr(fit.model.noise, name).sqrt() for name in COMPONENTS},
         nuisances=_nuisances(fit, settings),
         bias=fit.bias[:, :6],
+        groups=groups,
         history=fit.history,
         observability=_observability(fit.problem, state.R, state.t, C, fit.model.noise, uses, settings),
         posterior=_posterior(fit, excess.clamp_min(1.0)),
@@ -144,6 +148,7 @@ def joint_on_graph(solution: Solution, problem: Problem, fit: MapEstimate, setti
     found = attach(problem, fit, settings)
     rows = fit.model.measured.keep(fit.weight > REJECTED).rows_ok.sum((0, 2))
     excess = found.chi2 / (rows - 6.0).clamp_min(1.0)
+    covariance = found.covariance[:, :6, :6] * excess.clamp_min(1.0)[:, None, None]
     left = solution.camera_left_T_camera_right
     return replace(
         solution,
@@ -151,7 +156,7 @@ def joint_on_graph(solution: Solution, problem: Problem, fit: MapEstimate, setti
         camera_left_T_camera_right=None
         if left is None
         else rigid_from_rotation_translation(found.state.stereo_R, found.state.stereo_t),
-        covariance=found.covariance[:, :6, :6] * excess.clamp_min(1.0)[:, None, None],
+        covariance=covariance if solution.groups is None else solution.groups.grown(covariance),
     )
 
 

@@ -12,14 +12,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from rmis_calib.errors import InputError
 from rmis_calib.solver.model.batched_linalg import eliminate, forward_substitute
 from rmis_calib.solver.model.measurement_rows import END, HEAD, LINE, OWN, MeasurementRows
 from rmis_calib.solver.model.parameters import ParameterLayout, columns
-from rmis_calib.solver.model.residuals import LinearisedRows, State, linearise
+from rmis_calib.solver.model.residuals import LinearisedRows, Shaft, State, linearise
 
 
 @dataclass(frozen=True)
@@ -201,22 +201,14 @@ def normal_equations(model: WeightedModel, state: State, keep: bool = False) -> 
     """
     measured, layout = model.measured, model.layout
     linear, shaft = linearise(measured, state)
-    k, b, n = linear.r.shape
     p = layout.size
-    image = image_variance(measured, model.noise)
     factor = logdet = None
     if linear.r.requires_grad:
+        image = image_variance(measured, model.noise)
         J = columns(layout, linear, shaft, measured, state)
         white, logdet = _whitened(model, linear, image, torch.cat((J, linear.r[:, None]), dim=1))
     else:
-        augmented = torch.empty((k, k + p + 1, b, n), dtype=linear.r.dtype, device=linear.r.device)
-        covariance(linear.w, linear.a, image, measured.cameras, model.noise, augmented[:, :k], model.weight)
-        columns(layout, linear, shaft, measured, state, out=augmented[:, k:-1])
-        augmented[:, -1] = linear.r
-        eliminate(augmented)
-        factor = augmented[:, :k]
-        pivots = factor.diagonal(dim1=0, dim2=1).permute(2, 0, 1)  # (k, b, n)
-        white = augmented[:, k:].mul_(pivots.rsqrt()[:, None])
+        white, factor = _eliminated(model, state, linear, shaft)
     gram = torch.matmul(white.permute(0, 2, 1, 3), white.permute(0, 2, 3, 1)).sum(0)  # (b, p + 1, p + 1)
     return Normal(
         H=gram[:, :p, :p],
@@ -228,6 +220,46 @@ def normal_equations(model: WeightedModel, state: State, keep: bool = False) -> 
         factor=factor if keep else None,
         linear=linear if keep else None,
     )
+
+
+def group_sums(
+    model: WeightedModel, state: State, group: Int[Tensor, "b n"], count: int
+) -> tuple[Float[Tensor, "b g p p"], Float[Tensor, "b g p"]]:
+    """Information and score of `count` groups of motions, without priors; motions of no group (-1) do not count."""
+    sums = []
+    for trials, along in model.parts():
+        at, total = state.take(trials), None
+        for motions in along:
+            part = model.narrow(trials, motions)
+            linear, shaft = linearise(part.measured, at)
+            white, _ = _eliminated(part, at, linear, shaft)
+            member = torch.nn.functional.one_hot(group[trials, motions] + 1, count + 1)[..., 1:].to(white.dtype)
+            columns_last = white.permute(2, 0, 3, 1)  # (b, k, n, p + 1)
+            gram = torch.stack(
+                [(columns_last.mT @ (columns_last * one[:, None, :, None])).sum(1) for one in member.unbind(-1)], dim=1
+            )
+            total = gram if total is None else total + gram
+        assert total is not None
+        sums.append(total)
+    joined = torch.cat(sums)
+    return joined[..., :-1, :-1], joined[..., :-1, -1]
+
+
+def _eliminated(
+    model: WeightedModel, state: State, linear: LinearisedRows, shaft: Shaft
+) -> tuple[Float[Tensor, "k q b n"], Tensor]:
+    """L^-1 [J r] of every motion, with S = L L^T, and the eliminated systems; in place, not for autograd."""
+    measured, layout = model.measured, model.layout
+    k, b, n = linear.r.shape
+    image = image_variance(measured, model.noise)
+    augmented = torch.empty((k, k + layout.size + 1, b, n), dtype=linear.r.dtype, device=linear.r.device)
+    covariance(linear.w, linear.a, image, measured.cameras, model.noise, augmented[:, :k], model.weight)
+    columns(layout, linear, shaft, measured, state, out=augmented[:, k:-1])
+    augmented[:, -1] = linear.r
+    eliminate(augmented)
+    factor = augmented[:, :k]
+    pivots = factor.diagonal(dim1=0, dim2=1).permute(2, 0, 1)  # (k, b, n)
+    return augmented[:, k:].mul_(pivots.rsqrt()[:, None]), factor
 
 
 def _whitened(

@@ -11,7 +11,7 @@ from rmis_calib.solver.assess.next_motion import advise, measured_alike
 from tests.benchmarks.bench_solver_advice import SETTINGS as WITH_CORRECTION
 from tests.benchmarks.bench_solver_advice import VIEW, left, measure, next_motion, weak_recordings
 
-SETTINGS = replace(WITH_CORRECTION, bias_correction=False)
+SETTINGS = replace(WITH_CORRECTION, bias_correction=False, groups=0)
 WEAK = weak_recordings()
 
 

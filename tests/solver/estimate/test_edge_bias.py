@@ -33,7 +33,7 @@ def test_shift_shared_by_all_pictures_is_estimated(simulate, realistic):
     X = torch.as_tensor(truth["camera_right_T_arm"])
 
     def rms_deg(problem: Problem, unknowns: UnknownSettings) -> tuple[float, float]:
-        solution = solve(problem, SolverSettings(unknowns=unknowns))
+        solution = solve(problem, SolverSettings(unknowns=unknowns, groups=0))
         turn = matrix_to_rotvec(solution.camera_right_T_arm[:, :3, :3] @ X[:, :3, :3].mT)
         error = float(torch.rad2deg(turn.square().sum(-1).mean().sqrt()))
         return error, float(solution.rotation_sigma_deg.mean())

@@ -1,0 +1,251 @@
+"""Do parts of the data agree? Groups of neighbouring motions are left out in turn; where the answer moves by more than
+noise allows, the covariance grows.
+
+What a model leaves out (lens, compliance, an arm that rests, a tool that is another one) is shared by motions that lie
+near to each other and does not average out, so that sigma falls with 1/sqrt(N) and truth does not. Leaving out random
+motions does not show it; leaving out neighbours does (a delete-group jackknife: Shao & Tu 1995; cluster-robust
+covariance: Cameron & Miller 2015).
+
+With H the information, H_k and s_k the information and the score of group k, the estimate without it is off by
+d_k = (H - H_k)^-1 s_k, one Gauss-Newton step; noise alone would make its covariance V_k = (H - H_k)^-1 - H^-1. In the
+units of the answer's own covariance, W = (sum V_k)^-1/2 (sum d_k d_k^T) (sum V_k)^-1/2 is the identity on average.
+"""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from rmis_calib.solver.estimate.map_estimate import MapEstimate
+from rmis_calib.solver.estimate.outliers import REJECTED
+from rmis_calib.solver.model.batched_linalg import rescaled, unit_diagonal
+from rmis_calib.solver.model.measurement_rows import MeasurementRows
+from rmis_calib.solver.model.normal_equations import group_sums
+from rmis_calib.solver.solution import GroupCheck
+
+LEAST_GROUPS = 5
+"""Fewer say too little: below this many, covariances stay as they are."""
+MOTIONS_A_GROUP = 4
+"""Motions for each group that is made, on average."""
+LEAST_USED = 3
+"""Used motions a group, on average, below which a trial is left as it is."""
+LEVER_MM = 100.0
+"""Length that turns a change of the shaft's direction into a displacement: from the trocar to the working point."""
+LLOYD_ROUNDS = 12
+CLEAR = 0.99
+"""Quantile of chance beyond which a single direction, or a single group, is said to disagree."""
+_RIDGE = 0.02
+"""In units of the covariance: a direction that no group moves (it is the prior's) counts as agreeing."""
+
+
+def check_groups(fit: MapEstimate, asked: int) -> GroupCheck:
+    """Leave out groups of neighbours of every trial at once.
+
+    Args:
+        fit: the estimate.
+        asked: groups wanted; fewer where motions are few.
+    """
+    measured, state = fit.model.measured, fit.state
+    used = ((fit.weight > REJECTED) & _measured(measured)).any(0)  # (b, n)
+    count = min(asked, measured.motions // MOTIONS_A_GROUP)
+    enough = used.sum(-1) >= LEAST_USED * count
+    b, like = state.t.shape[0], state.t
+    eye = torch.eye(6, dtype=like.dtype, device=like.device).expand(b, 6, 6)
+    if count < LEAST_GROUPS:
+        none = torch.full_like(used, -1, dtype=torch.int64)
+        return GroupCheck(
+            group=none,
+            count=0,
+            shift=like.new_zeros(b, 0, 6),
+            sigmas=like.new_zeros(b, 0),
+            growth=eye,
+            halves=like.new_zeros(b, 6),
+            halves_sigmas=like.new_zeros(b),
+            change=like.new_zeros(b, 6),
+            change_sigmas=like.new_zeros(b),
+            change_at=torch.zeros_like(none[:, 0]),
+            inflation=torch.ones_like(like[:, 0]),
+        )
+    group = neighbours(where_motions_are(measured), used, count)
+    H_k, s_k = group_sums(fit.model, state, group, count)  # (b, k, p, p), (b, k, p)
+    prior = fit.model.layout.sigma.square().reciprocal()
+    H = H_k.sum(1) + torch.diag_embed(prior)
+    deviation, _ = fit.model.layout.prior(state)
+    s_k = s_k - (s_k.sum(1) + prior * deviation)[:, None] / count  # what the bias correction left of the score
+    shift, covariance_k, covariance = _left_out(H, H_k, s_k)
+    root, inverse_root = _roots(covariance)
+    own = shift @ inverse_root.mT  # (b, k, 6)
+    extra = inverse_root[:, None] @ (covariance_k - covariance[:, None]) @ inverse_root[:, None].mT
+    expected = extra.sum(1) + _RIDGE * eye
+    found = own.mT @ own + _RIDGE * eye
+    E_values, E_vectors = torch.linalg.eigh(expected)
+    narrow = E_vectors * E_values.rsqrt()[:, None] @ E_vectors.mT
+    W = narrow @ found @ narrow
+    values, vectors = torch.linalg.eigh(0.5 * (W + W.mT))
+    # The mean of all directions is known to a fifth with eight groups; a single direction counts only where it is
+    # beyond what the largest of six directions reaches by chance.
+    mean = values.mean(-1, keepdim=True).clamp_min(1.0)
+    factor = torch.where(values > _largest_by_chance(count), values, 0.0).maximum(mean)
+    factor = torch.where(enough[:, None], factor, 1.0)
+    growth = root @ (vectors * factor.sqrt()[:, None] @ vectors.mT) @ inverse_root
+    first_half = _first_half(where_motions_are(measured), group, count)
+    halves, apart = _difference(H_k, s_k, prior, deviation, first_half[:, None], growth)
+    changes, change_apart = _changes_in_time(fit, growth, count)
+    clearest = change_apart.argmax(-1)
+    sigmas = torch.linalg.solve(extra + _RIDGE * eye[:, None], own[..., None])[..., 0]
+    return GroupCheck(
+        group=torch.where(enough[:, None], group, -1),
+        count=count,
+        shift=shift,
+        sigmas=(sigmas * own).sum(-1).clamp_min(0.0).sqrt(),
+        growth=growth,
+        halves=halves[:, 0],
+        halves_sigmas=torch.where(enough, apart[:, 0], 0.0),
+        change=torch.take_along_dim(changes, clearest[:, None, None], dim=1)[:, 0],
+        change_sigmas=torch.where(enough, change_apart.amax(-1), 0.0),
+        change_at=_first_of_block(measured.motions, count, like)[clearest + 1],
+        inflation=factor.mean(-1).sqrt(),
+    )
+
+
+def where_motions_are(measured: MeasurementRows) -> Float[Tensor, "b n 9"]:
+    """Where the shaft is in `arm`: RCM and working point, mm, and its direction times a lever: alike for neighbours in
+    joint space."""
+    p, v = measured.p.permute(1, 2, 0), measured.v.permute(1, 2, 0)
+    return torch.cat((p, p + LEVER_MM * v, LEVER_MM * v), dim=-1)
+
+
+def neighbours(place: Float[Tensor, "b n d"], used: Tensor, count: int) -> Int[Tensor, "b n"]:
+    """k-means groups of the used motions, -1 for the others; starts are the farthest from each other, so that nothing
+    is random."""
+    masked = torch.where(used[..., None], place, 0.0)
+    mean = masked.sum(1, keepdim=True) / used.sum(1).clamp_min(1)[:, None, None]
+    distance = (place - mean).square().sum(-1)
+    centres = []
+    for _ in range(count):
+        index = torch.where(used, distance, -1.0).argmax(-1)
+        centre = torch.take_along_dim(place, index[:, None, None], dim=1)
+        nearer = (place - centre).square().sum(-1)
+        distance = nearer if not centres else torch.minimum(distance, nearer)
+        centres.append(centre)
+    centre = torch.cat(centres, dim=1)
+    group = used.long()
+    for _ in range(LLOYD_ROUNDS):
+        group = torch.cdist(place, centre).argmin(-1)
+        member = torch.nn.functional.one_hot(group, count).to(place.dtype) * used[..., None]
+        sizes = member.sum(1)
+        moved = member.mT @ masked / sizes.clamp_min(1.0)[..., None]
+        centre = torch.where(sizes[..., None] > 0, moved, centre)
+    return torch.where(used, group, -1)
+
+
+def _first_half(place: Float[Tensor, "b n d"], group: Int[Tensor, "b n"], count: int) -> Float[Tensor, "b k"]:
+    """1 for the groups that make up one half of the used motions, on one side along where they spread most."""
+    member = torch.nn.functional.one_hot(group + 1, count + 1)[..., 1:].to(place.dtype)
+    sizes = member.sum(1)
+    centre = member.mT @ place / sizes.clamp_min(1.0)[..., None]
+    total = sizes.sum(-1).clamp_min(1.0)
+    centred = (centre - (sizes[..., None] * centre).sum(1, keepdim=True) / total[:, None, None]) * (sizes > 0)[
+        ..., None
+    ]
+    _, vectors = torch.linalg.eigh(centred.mT @ (sizes[..., None] * centred))
+    order = (centred @ vectors[..., -1:])[..., 0].argsort(-1)
+    ordered = torch.take_along_dim(sizes, order, dim=-1)
+    is_first = ordered.cumsum(-1) - 0.5 * ordered < 0.5 * total[:, None]
+    return torch.zeros_like(is_first).scatter(-1, order, is_first).to(place.dtype)
+
+
+def _changes_in_time(
+    fit: MapEstimate, growth: Float[Tensor, "b 6 6"], count: int
+) -> tuple[Float[Tensor, "b s 6"], Float[Tensor, "b s"]]:
+    """Difference of what comes before and after each border of `count` consecutive blocks, and in sigmas.
+
+    Where most motions of a block were rejected they count in full: a camera that was knocked looks like a block of
+    outliers.
+    """
+    measured, weight, b = fit.model.measured, fit.weight, fit.state.t.shape[0]
+    block = torch.arange(measured.motions, device=weight.device) * count // measured.motions
+    member = torch.nn.functional.one_hot(block, count).to(weight.dtype)
+    counted = _measured(measured)
+    share = (
+        ((weight < REJECTED) & counted).to(weight.dtype) @ member / (counted.to(weight.dtype) @ member).clamp_min(1.0)
+    )
+    mostly = (share > 0.5).any(0).to(weight.dtype) @ member.T > 0.5  # (b, n)
+    model = fit.model if fit.model.weight is None else replace(fit.model, weight=torch.where(mostly, 1.0, weight))
+    H_k, s_k = group_sums(model, fit.state, block.expand(b, -1), count)
+    prior = fit.model.layout.sigma.square().reciprocal()
+    deviation, _ = fit.model.layout.prior(fit.state)
+    before = torch.tril(torch.ones(count - 1, count, dtype=weight.dtype, device=weight.device))
+    return _difference(H_k, s_k, prior, deviation, before.expand(b, -1, -1), growth)
+
+
+def _first_of_block(motions: int, count: int, like: Tensor) -> Int[Tensor, " k"]:
+    """Number of the first motion of each of `count` consecutive blocks."""
+    block = torch.arange(count, device=like.device)
+    return (block * motions + count - 1) // count
+
+
+def _difference(
+    H_k: Float[Tensor, "b k p p"],
+    s_k: Float[Tensor, "b k p"],
+    prior: Float[Tensor, "b p"],
+    deviation: Float[Tensor, "b p"],
+    first: Float[Tensor, "b s k"],
+    growth: Float[Tensor, "b 6 6"],
+) -> tuple[Float[Tensor, "b s 6"], Float[Tensor, "b s"]]:
+    """How far the answers of two parts of the data are apart, one Gauss-Newton step each from that of all, and in their
+    grown sigmas.
+
+    Args:
+        first: 1 for the groups of the first part, 0 for those of the other; `s` ways to part them.
+    """
+    estimates = []
+    for part in (first, 1.0 - first):
+        H = torch.einsum("bsk,bkpq->bspq", part, H_k) + torch.diag_embed(prior)[:, None]
+        g = part @ s_k + (prior * deviation)[:, None]
+        _, scale = unit_diagonal(H)
+        inverse = rescaled(torch.linalg.pinv(rescaled(H, scale), hermitian=True, rtol=1e-13), scale)
+        covariance = growth[:, None] @ inverse[..., :6, :6] @ growth[:, None].mT
+        estimates.append((-(inverse @ g[..., None])[..., :6, 0], covariance))
+    gap = estimates[0][0] - estimates[1][0]
+    _, narrow = _roots(estimates[0][1] + estimates[1][1])
+    return gap, (narrow @ gap[..., None])[..., 0].norm(dim=-1)
+
+
+def _measured(measured: MeasurementRows) -> Tensor:
+    cameras = torch.tensor(measured.row_camera, device=measured.rows_ok.device)
+    return torch.stack([measured.rows_ok[cameras == c].any(0) for c in range(measured.cameras)])
+
+
+def _left_out(
+    H: Float[Tensor, "b p p"], H_k: Float[Tensor, "b k p p"], s_k: Float[Tensor, "b k p"]
+) -> tuple[Float[Tensor, "b k 6"], Float[Tensor, "b k 6 6"], Float[Tensor, "b 6 6"]]:
+    """Of the transform: its shift without each group, its covariance then, and that of all."""
+    _, scale = unit_diagonal(H)
+    rest = rescaled(H[:, None] - H_k, scale[:, None])
+    inverse = torch.linalg.pinv(rest, hermitian=True, rtol=1e-13)
+    shift = (inverse @ (s_k * scale[:, None])[..., None])[..., 0] * scale[:, None]
+    covariance_k = rescaled(inverse, scale[:, None])
+    covariance = rescaled(torch.linalg.pinv(rescaled(H, scale), hermitian=True, rtol=1e-13), scale)
+    return shift[..., :6], covariance_k[..., :6, :6], covariance[..., :6, :6]
+
+
+def _roots(matrix: Float[Tensor, "*b 6 6"]) -> tuple[Float[Tensor, "*b 6 6"], Float[Tensor, "*b 6 6"]]:
+    """Square root and its inverse of a covariance: root root^T = matrix."""
+    scaled, scale = unit_diagonal(matrix)
+    values, vectors = torch.linalg.eigh(scaled)
+    values = values.clamp_min(1e-12).sqrt()
+    back = scale.reciprocal()
+    return back[..., :, None] * vectors * values[..., None, :], (vectors / values[..., None, :]).mT * scale[
+        ..., None, :
+    ]
+
+
+def _largest_by_chance(count: int) -> float:
+    """What the largest eigenvalue of W exceeds in one of a hundred right models: of a 6 x 6 Wishart matrix with
+    count - 1 degrees of freedom over these (Johnstone 2001)."""
+    n, p = max(count - 1, 1), 6
+    centre = (max(n - 1, 0) ** 0.5 + p**0.5) ** 2
+    spread = (max(n - 1, 0) ** 0.5 + p**0.5) * (1.0 / max(n - 1, 1) ** 0.5 + p**-0.5) ** (1.0 / 3.0)
+    return (centre + 2.02 * spread) / n
