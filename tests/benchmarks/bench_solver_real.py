@@ -21,7 +21,7 @@ import yaml
 from rmis_calib.cli import main as command_line
 from rmis_calib.io import ShaftObservations
 from rmis_calib.solver import Problem, SolverSettings, solve
-from rmis_calib.solver.assess.observability import VERDICTS
+from rmis_calib.solver.observability import VERDICTS
 from rmis_calib.solver.settings import UnknownSettings
 from tests.benchmarks.solver_common import errors, rotation_deg, translation_mm
 

@@ -102,7 +102,7 @@ def test_neighbours_are_grouped() -> None:
 
 
 def knocked(realistic: dict, angle: float, simulate) -> rc.ShaftObservations:
-    """64 motions of a still camera, in random order; it is turned by `angle` about its arm's z axis after half of them."""
+    """64 motions of a still camera, in random order, which is turned by `angle` about z of `arm` after half of them."""
     _, _, arrays = simulate(trials=1, positions_laparoscope=1, positions_instrument=4, **realistic)
     order = np.random.default_rng(0).permutation(64)
     turn = np.eye(4)
@@ -128,7 +128,7 @@ def test_a_camera_that_was_knocked_is_told_and_not_believed(simulate, realistic,
     assert result.status == "weak"
     assert "what comes before motion 32 and after differs" in result.message
     change = result.consistency["change"]
-    assert change["sigmas"] > 6.0
+    assert change["sigmas"] > 5.5
     assert change["rotation_deg"] == pytest.approx(np.rad2deg(angle), rel=0.6)
     assert rc.CalibrationResult.from_dict(result.to_dict()).consistency == result.to_dict()["consistency"]
 
