@@ -54,6 +54,13 @@ class CalibrationConfig:
     """Error of a contour point that every picture of a camera shares (lens model, edge detector), 1 sigma, px. It does
     not average out, so each is an unknown with this prior. 0.02 to 0.04 px were measured on rendered pictures;
     estimating it took a rendered recording from 0.084 deg and 0.25 mm off to 0.02 deg and 0.11 mm."""
+    focal_sigma_relative: float = 0.005
+    """How well the cameras' focal lengths are known, 1 sigma, relative. Where the data see them they are corrected;
+    where not (a camera that stands still absorbs a wrong one without a trace), this enters the covariance."""
+    centre_sigma_px: float = 3.0
+    """The same of the principal points, px per axis."""
+    lens_sigma: float = 0.03
+    """The same of the radial distortion k1."""
     clock_search_s: float = 3.0
     """With `solver.unknowns.clock`: clock offsets are searched this far to either side of the recording's own. Public
     recordings are off by up to 2.4 s."""
@@ -79,7 +86,9 @@ class CalibrationConfig:
             raise ValueError("1 or more")
         return value
 
-    @field_validator("model_sigma_px", "edge_bias_px", "clock_search_s")
+    @field_validator(
+        "model_sigma_px", "edge_bias_px", "clock_search_s", "focal_sigma_relative", "centre_sigma_px", "lens_sigma"
+    )
     @classmethod
     def _not_negative(cls, value: float) -> float:
         if value < 0:

@@ -23,7 +23,8 @@ _SHAPES: dict[str, tuple[int, ...]] = {
     **{f"sigma_{kind}_{side}": shape for kind, shape in _SIGMA.items() for side in _SIDES},
 }
 _LEVELS = tuple(f"sigma_{what}_{unit}" for what in ("kinematics", "camera", "stereo") for unit in ("mm", "rad"))
-_SCALARS = ("shaft_radius_mm", "sigma_image", "sigma_edge_bias", *_LEVELS)
+_INTRINSICS = ("sigma_focal", "sigma_centre", "sigma_lens")
+_SCALARS = ("shaft_radius_mm", "sigma_image", "sigma_edge_bias", *_INTRINSICS, *_LEVELS)
 _NEEDS = {"contour": "shaft_radius_mm", "end": "rcm_s_end_mm", "head": "rcm_p_head"}
 # Rounding of single precision stays below; a direction that was never normalised does not.
 _UNIT_TOLERANCE = 1e-6
@@ -147,7 +148,7 @@ def _check_sigma(name: str, sigma: float) -> None:
     """Refuse a sigma whose size says that it is in pixels or degrees."""
     if name.endswith("_rad") and sigma > _MAX_SIGMA_RAD:
         hint, expected = "looks like degrees; multiply by pi / 180", f"at most {_MAX_SIGMA_RAD} rad"
-    elif not name.endswith(("_rad", "_mm")) and sigma > _MAX_SIGMA_IMAGE:
+    elif not name.endswith(("_rad", "_mm", "_focal", "_lens")) and sigma > _MAX_SIGMA_IMAGE:
         hint, expected = "looks like pixels; divide by the focal length", f"at most {_MAX_SIGMA_IMAGE} focal lengths"
     else:
         return

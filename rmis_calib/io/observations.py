@@ -86,6 +86,12 @@ class ShaftObservations:
     sigma_edge_bias: float | None = None
     """Of an error that all pictures of a camera share: each contour point is off across its line by the same amount in
     every motion (lens model, edge detector), normalised units. It does not average out."""
+    sigma_focal: float | None = None
+    """Of each camera's focal length, relative."""
+    sigma_centre: float | None = None
+    """Of each camera's principal point, per axis, in focal lengths."""
+    sigma_lens: float | None = None
+    """Of each camera's radial distortion k1."""
     sigma_axis_right: np.ndarray | None = None
     """(N,): one sigma of both points across the line, normalised units; NaN: `sigma_image`. The others likewise."""
     sigma_axis_left: np.ndarray | None = None

@@ -47,6 +47,9 @@ def assemble(
         shaft_radius_mm=recording.shaft_diameter_mm / 2,
         rcm_s_end_mm=poses.rcm_s_end_mm.cpu().numpy(),
         sigma_edge_bias=config.edge_bias_px / float(recording.stereo.right.focal),
+        sigma_focal=config.focal_sigma_relative,
+        sigma_centre=config.centre_sigma_px / float(recording.stereo.right.focal),
+        sigma_lens=config.lens_sigma,
         **head_observations(recording, poses),
         **arrays,
     )

@@ -33,6 +33,9 @@ class NoiseLevels:
         stereo_mm: per axis, of `camera_left_T_camera_right`, drawn once.
         stereo_rad: its orientation.
         edge_bias: of a shift across the line that a contour point has in every motion alike, normalised units.
+        focal: of each camera's focal length, relative.
+        centre: of its principal point, per axis, in focal lengths.
+        lens: of its radial distortion k1.
     """
 
     image: Float[Tensor, "*batch"]
@@ -43,6 +46,9 @@ class NoiseLevels:
     stereo_mm: Float[Tensor, "*batch"]
     stereo_rad: Float[Tensor, "*batch"]
     edge_bias: Float[Tensor, "*batch"]
+    focal: Float[Tensor, "*batch"]
+    centre: Float[Tensor, "*batch"]
+    lens: Float[Tensor, "*batch"]
 
 
 @dataclass(frozen=True)
@@ -223,6 +229,7 @@ OBSERVATION_KEYS = (
     "contour_left", "shaft_radius_mm", "end_right", "end_left", "rcm_s_end_mm", "head_right", "head_left",
     "rcm_p_head", "valid_right", "valid_left", "sigma_image", "sigma_kinematics_mm", "sigma_kinematics_rad",
     "sigma_camera_mm", "sigma_camera_rad", "sigma_stereo_mm", "sigma_edge_bias", "sigma_stereo_rad",
+    "sigma_focal", "sigma_centre", "sigma_lens",
     "sigma_axis_right", "sigma_axis_left", "sigma_contour_right", "sigma_contour_left", "sigma_end_right",
     "sigma_end_left", "sigma_head_right", "sigma_head_left",
 )  # fmt: skip
@@ -271,7 +278,7 @@ class _Reader:
 
     def noise(self) -> NoiseLevels:
         levels = {field.name: self.filled(f"sigma_{field.name}") for field in fields(NoiseLevels)}
-        for name in ("camera_mm", "camera_rad", "edge_bias"):
+        for name in ("camera_mm", "camera_rad", "edge_bias", "focal", "centre", "lens"):
             levels[name] = torch.nan_to_num(levels[name], nan=0.0)
         return NoiseLevels(**levels)
 

@@ -69,6 +69,10 @@ class UnknownSettings:
     edge_bias: bool = True
     """Estimate the shift across its line that each line point has in every motion alike (an error of the lens model or
     of the edge detector does not average out), where the observations name its prior (`sigma_edge_bias`)."""
+    intrinsics: bool = True
+    """Correct each camera's focal length, principal point and radial distortion, where the observations name their
+    priors (`sigma_focal`, `sigma_centre`, `sigma_lens`). A camera that stands still absorbs wrong ones without a trace:
+    there only the priors enter the covariance."""
     held_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.95
     """An unknown whose sigma the data do not bring below this part of its prior is reported as held."""
 

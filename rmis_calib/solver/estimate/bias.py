@@ -26,7 +26,15 @@ from rmis_calib.geometry.rotations import rotvec_to_matrix
 from rmis_calib.solver.model.batched_linalg import cross, dot, unit
 from rmis_calib.solver.model.measurement_rows import LINE, MeasurementRows
 from rmis_calib.solver.model.normal_equations import NoiseModel, WeightedModel, image_variance, normal_equations
-from rmis_calib.solver.model.residuals import Shaft, State, _line_geometry, own_rows, predict_shaft, shaft_poses
+from rmis_calib.solver.model.residuals import (
+    Shaft,
+    State,
+    _line_geometry,
+    corrected_points,
+    own_rows,
+    predict_shaft,
+    shaft_poses,
+)
 
 SIMULATED_PART = 16
 """One motion in so many is simulated in long recordings: the expected score is then known to about a fifth of its
@@ -104,11 +112,12 @@ def simulate(measured: MeasurementRows, state: State, noise: NoiseModel, draws: 
     ends = measured.end_xy.shape[1]
     if measured.has_ends:
         q = seen.p + (measured.s_end + state.end_offset[:, None]) * seen.d
-        simulated = replace(simulated, end_xy=q[:2] / q[2] + sigma[lines : lines + ends] * draws.end)
+        end_xy = q[:2] / q[2] + sigma[lines : lines + ends] * draws.end
+        simulated = replace(simulated, end_xy=_uncorrected(end_xy, state))
     if measured.has_heads:
         q = seen.p + seen.head
         heads = sigma[lines + ends : lines + ends + draws.head[:, :, 0, 0].numel()].view_as(draws.head)
-        simulated = replace(simulated, head_xy=q[:2] / q[2] + heads * draws.head)
+        simulated = replace(simulated, head_xy=_uncorrected(q[:2] / q[2] + heads * draws.head, state))
     own = []
     for rows, draw in zip(measured.own, draws.own, strict=True):
         c = rows.camera
@@ -120,6 +129,11 @@ def simulate(measured: MeasurementRows, state: State, noise: NoiseModel, draws: 
         moved = scaled(noise.kinematics_mm, draws.shift)
         own.append(replace(rows, shift=rows.shift + shift, turn=turn, moved=moved))
     return replace(simulated, own=tuple(own))
+
+
+def _uncorrected(xy: Float[Tensor, "2 c b n"], state: State) -> Float[Tensor, "2 c b n"]:
+    """The points whose correction these are, to first order."""
+    return 2.0 * xy - corrected_points(xy, state)
 
 
 def expected_score(model: WeightedModel, state: State, simulated_motions: int, seed: int) -> ScoreBias:

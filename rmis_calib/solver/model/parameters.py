@@ -9,7 +9,7 @@ from torch import Tensor
 from rmis_calib.errors import InputError
 from rmis_calib.solver.model.batched_linalg import add_cross_, batch_last, cross, dot, rotate
 from rmis_calib.solver.model.measurement_rows import LINE, MeasurementRows, line_points
-from rmis_calib.solver.model.residuals import LinearisedRows, Shaft, State, rcm_axes
+from rmis_calib.solver.model.residuals import LinearisedRows, Shaft, State, intrinsic_effects, rcm_axes
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import NoiseSettings, UnknownSettings
 
@@ -22,6 +22,7 @@ UNITS = {
     "joint_offset": "rad or mm",
     "clock": "s",
     "edge_bias": "focal lengths",
+    "intrinsics": "relative, focal lengths, k1",
 }
 """Unit of each nuisance block."""
 
@@ -77,6 +78,7 @@ class ParameterLayout:
             "joint_offset": state.joint_offset - origin.joint_offset,
             "clock": (state.clock - origin.clock)[:, None],
             "edge_bias": (state.edge_bias - origin.edge_bias).flatten(1),
+            "intrinsics": (state.intrinsics - origin.intrinsics).flatten(1),
         }
         return torch.cat([deviation[name] for name in self.blocks], dim=-1), self.sigma.square().reciprocal()
 
@@ -93,6 +95,7 @@ class NuisancePriors:
         joint_offset_sigma: prior of each joint offset (no joints: none can be estimated).
         joint_offset_at, clock_at: where the kinematics were evaluated.
         edge_bias: prior of the shift of each line row; 0 where there is none.
+        intrinsics: prior of each camera's corrections; 0 where there is none.
     """
 
     stereo: Float[Tensor, "b 4 4"]
@@ -103,10 +106,13 @@ class NuisancePriors:
     joint_offset_at: Float[Tensor, "b j"]
     clock_at: Float[Tensor, " b"]
     edge_bias: Float[Tensor, "b l c"]
+    intrinsics: Float[Tensor, "b c 4"]
 
     @classmethod
     def of(cls, problem: Problem) -> "NuisancePriors":
         """Of a problem with one trial axis."""
+        level = problem.noise
+        intrinsics = torch.stack((level.focal, level.centre, level.centre, level.lens), dim=-1)
         none = problem.radius_mm.new_zeros(problem.n_trials, 0)
         sigma = none if problem.joint_offset_sigma is None else problem.joint_offset_sigma
         return cls(
@@ -118,6 +124,7 @@ class NuisancePriors:
             joint_offset_at=torch.zeros_like(sigma) if problem.joint_offset_at is None else problem.joint_offset_at,
             clock_at=torch.zeros_like(problem.radius_mm) if problem.clock_at is None else problem.clock_at,
             edge_bias=problem.noise.edge_bias[:, None, None].expand(-1, line_points(problem), problem.n_cameras),
+            intrinsics=intrinsics[:, None].expand(-1, problem.n_cameras, -1),
         )
 
     def repeat(self, part: slice, times: int) -> "NuisancePriors":
@@ -139,6 +146,7 @@ def initial_state(nominal: NuisancePriors, R: Float[Tensor, "b 3 3"], t: Float[T
         joint_offset=torch.zeros_like(nominal.joint_offset_at),
         clock=zero,
         edge_bias=torch.zeros_like(nominal.edge_bias),
+        intrinsics=torch.zeros_like(nominal.intrinsics),
     )
 
 
@@ -169,6 +177,8 @@ def make_layout(
         entries.append(("clock", 1, torch.full_like(infinite, settings.clock_sigma_s)))
     if settings.edge_bias:
         entries.append(("edge_bias", origin.edge_bias[0].numel(), nominal.edge_bias.flatten(1)))
+    if settings.intrinsics:
+        entries.append(("intrinsics", origin.intrinsics[0].numel(), nominal.intrinsics.flatten(1)))
     entries = [entry for entry in entries if bool((entry[2] > 0).any())]
     blocks, sigmas, start = {}, [], 0
     for name, width, sigma in entries:
@@ -213,7 +223,9 @@ def columns(
             else:
                 target.copy_(linear.w[:, 1::2])
     for name, part in layout.blocks.items():
-        if name not in ("rotation", "translation", "stereo_rotation", "stereo_translation"):
+        if name == "intrinsics":
+            by_parameter[part] = intrinsic_effects(measured, state, shaft)
+        elif name not in ("rotation", "translation", "stereo_rotation", "stereo_translation"):
             by_parameter[part] = _columns_of(name, linear, shaft, measured, state)
     return out
 
@@ -234,6 +246,8 @@ def _columns_of(
         return linear.radius[None]
     if name == "end_offset":
         return linear.end[None]
+    if name == "intrinsics":
+        return intrinsic_effects(measured, state, shaft)
     if name == "edge_bias":
         return _shifts(measured, linear.r).transpose(0, 1)
     return _displaced(name, linear, measured, state)

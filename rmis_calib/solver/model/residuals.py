@@ -74,6 +74,7 @@ class State:
         joint_offset: in each joint's unit.
         clock: seconds added to the time at which the joints were read.
         edge_bias: shift across its line that a line row of each camera has in every motion alike, normalised units.
+        intrinsics: by how much each camera's points are to be corrected (`corrected_points`).
     """
 
     R: Float[Tensor, "b 3 3"]
@@ -86,6 +87,7 @@ class State:
     joint_offset: Float[Tensor, "b j"]
     clock: Float[Tensor, " b"]
     edge_bias: Float[Tensor, "b l c"]
+    intrinsics: Float[Tensor, "b c 4"]
 
     def where(self, chosen: Tensor, other: "State") -> "State":
         """This state in the chosen trials, `other` elsewhere."""
@@ -125,6 +127,8 @@ class State:
                 changed[name] = getattr(self, name) + step[name][:, 0]
         if "edge_bias" in step:
             changed["edge_bias"] = self.edge_bias + step["edge_bias"].reshape(self.edge_bias.shape)
+        if "intrinsics" in step:
+            changed["intrinsics"] = self.intrinsics + step["intrinsics"].reshape(self.intrinsics.shape)
         return replace(self, **changed)
 
 
@@ -245,7 +249,7 @@ def _rows(measured: MeasurementRows, state: State, shaft: Shaft) -> Float[Tensor
     if measured.has_ends:
         parts.append(_end_geometry(measured, state, shaft)[0])
     if measured.has_heads:
-        parts.append(_head_geometry(measured, shaft)[0].flatten(0, 1))
+        parts.append(_head_geometry(measured, state, shaft)[0].flatten(0, 1))
     return torch.cat(parts)
 
 
@@ -290,7 +294,7 @@ def _linearise_analytically(measured: MeasurementRows, state: State, shaft: Shaf
         a[:, part] = -gain * chi * s_end * m[:, 0]
     if measured.has_heads:
         part = slice(lines * c + ends, None)
-        e, w_head = _head_geometry(measured, shaft)
+        e, w_head = _head_geometry(measured, state, shaft)
         both = torch.cat((w_head, cross(shaft.head[:, None].expand_as(w_head), w_head)), dim=1)
         both = torch.where(measured.head_ok, _into_right(camera_R, both), 0.0)
         r[part] = torch.where(measured.head_ok, e, 0.0).flatten(0, 1)
@@ -411,7 +415,7 @@ class LineGeometry:
 
 
 def _line_geometry(measured: MeasurementRows, state: State, shaft: Shaft, radius: Tensor | float = 0.0) -> LineGeometry:
-    x, y = measured.line_xy.unbind()
+    x, y = corrected_points(measured.line_xy, state).unbind()
     sine = (measured.line_rho * (state.radius[:, None] / shaft.D)).clamp(-MAX_SINE, MAX_SINE)
     cosine = (1.0 - sine.square()).sqrt()
     n_image = torch.addcmul(cosine * shaft.m[:2, None], sine, shaft.u[:2, None])
@@ -422,6 +426,47 @@ def _line_geometry(measured: MeasurementRows, state: State, shaft: Shaft, radius
         f = f + state.edge_bias.permute(1, 2, 0)[..., None]
     kappa = torch.addcmul(cosine * X_u, sine, X_m, value=-1.0) / (shaft.D * cosine * n_xy)
     return LineGeometry(f, sine, cosine, kappa, X_d / n_xy - kappa * shaft.s0, n_image / n_xy)
+
+
+def corrected_points(xy: Float[Tensor, "2 *k c b n"], state: State) -> Float[Tensor, "2 *k c b n"]:
+    """Image points as they are once a camera's intrinsics are corrected.
+
+    Normalised points of wrong intrinsics are off by xy q_0 (focal length), (q_1, q_2) (centre) and xy r^2 q_3 (lens),
+    to first order in these, with q the state's `intrinsics` of the camera.
+    """
+    if not _matters(state.intrinsics):
+        return xy
+    q = state.intrinsics.permute(2, 1, 0)[..., None]  # (4, c, b, 1)
+    x, y = xy.unbind()
+    scale = q[0] + (x * x + y * y) * q[3]
+    return torch.stack((x + (x * scale + q[1]), y + (y * scale + q[2])))
+
+
+def intrinsic_effects(measured: MeasurementRows, state: State, shaft: Shaft) -> Float[Tensor, "q k b n"]:
+    """Effects of each camera's four corrections on every row, camera by camera."""
+    rows = [(_line_geometry(measured, state, shaft).n_image, measured.line_xy)]
+    if measured.has_ends:
+        _, chi, _, gain = _end_geometry(measured, state, shaft)
+        X_u = _along(shaft.u, *corrected_points(measured.end_xy, state).unbind())
+        X_u = torch.where(X_u.abs() < MIN_COSINE, MIN_COSINE, X_u)
+        # d e / d xy = (d chi / d xy) / slope, with chi = X_d / X_u and 1 / slope = gain D
+        across = (shaft.d[:2] - chi * shaft.u[:2]) * (gain * shaft.D / X_u)
+        rows.append((across[:, None], measured.end_xy[:, None]))
+    if measured.has_heads:
+        eye = torch.eye(2, dtype=shaft.D.dtype, device=shaft.D.device)[..., None, None, None]
+        rows.append((eye.expand(2, 2, *shaft.D.shape), measured.head_xy[:, None].expand(2, 2, *shaft.D.shape)))
+    effects = []
+    for normal, xy in rows:
+        x, y = xy.unbind()
+        r2 = x * x + y * y
+        along = normal[0] * x + normal[1] * y
+        effects.append(torch.stack((along, normal[0].expand_as(x), normal[1].expand_as(x), along * r2)))
+    if measured.own:
+        effects.append(effects[0].new_zeros((4, measured.own_components, *effects[0].shape[2:])))
+    effect = torch.cat(effects, dim=1)  # (4, rows a camera, c, b, n)
+    cameras = torch.eye(measured.cameras, dtype=effect.dtype, device=effect.device)
+    by_camera = effect[None] * cameras[:, None, None, :, None, None]  # (c', 4, rows a camera, c, b, n)
+    return torch.where(measured.rows_ok, by_camera.flatten(2, 3).flatten(0, 1), 0.0)
 
 
 def _along(axis: Float[Tensor, "3 c b n"], x: Float[Tensor, "*l c b n"], y: Float[Tensor, "*l c b n"]) -> Tensor:
@@ -437,7 +482,7 @@ def _held(measured: MeasurementRows, value: Tensor) -> Tensor:
 
 def _end_geometry(measured: MeasurementRows, state: State, shaft: Shaft) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """e, chi, s_e and d e / d s_e without its sign, all (c, b, n)."""
-    x, y = measured.end_xy.unbind()
+    x, y = corrected_points(measured.end_xy, state).unbind()
     u, d, m = shaft.u, shaft.d, shaft.m
     X_u, X_d = _along(u, x, y), _along(d, x, y)
     X_u = torch.where(X_u.abs() < MIN_COSINE, MIN_COSINE, X_u)
@@ -454,12 +499,13 @@ def _end_geometry(measured: MeasurementRows, state: State, shaft: Shaft) -> tupl
     return (chi - (shaft.s0 + s_end) / shaft.D) / slope, chi, s_end, gain
 
 
-def _head_geometry(measured: MeasurementRows, shaft: Shaft) -> tuple[Tensor, Tensor]:
+def _head_geometry(measured: MeasurementRows, state: State, shaft: Shaft) -> tuple[Tensor, Tensor]:
     """e (2, c, b, n) and w (3, 2, c, b, n)."""
     q = shaft.p + shaft.head
     depth = torch.where(q[2].abs() < MIN_COSINE, MIN_COSINE, q[2])
     x, y, zero = q[0] / depth, q[1] / depth, torch.zeros_like(depth)
-    e = torch.stack((measured.head_xy[0] - x, measured.head_xy[1] - y))
+    seen = corrected_points(measured.head_xy, state)
+    e = torch.stack((seen[0] - x, seen[1] - y))
     w = torch.stack(
         (torch.stack((-1.0 / depth, zero)), torch.stack((zero, -1.0 / depth)), torch.stack((x / depth, y / depth)))
     )

@@ -28,7 +28,9 @@ def scene(simulate):
     one = torch.full((1,), 0.05, dtype=torch.float64)  # an exact stereo pair would not be refined
     problem = replace(
         problem,
-        noise=replace(problem.noise, stereo_mm=one, stereo_rad=one, edge_bias=1e-3 * one),
+        noise=replace(
+            problem.noise, stereo_mm=one, stereo_rad=one, edge_bias=1e-3 * one, focal=one, centre=one, lens=one
+        ),
         joint_derivative=joint,
         clock_derivative=clock,
         joint_offset_sigma=torch.ones(1, 2, dtype=torch.float64),
@@ -113,7 +115,7 @@ def test_jacobian_of_every_unknown_equals_autodiff(scene):
     layout = make_layout(NuisancePriors.of(problem), measured, state, settings.unknowns, settings.noise)
     assert list(layout.blocks) == [
         "rotation", "translation", "stereo_rotation", "stereo_translation", "radius", "end_offset", "rcm_offset",
-        "joint_offset", "clock", "edge_bias",
+        "joint_offset", "clock", "edge_bias", "intrinsics",
     ]  # fmt: skip
     exact = replace_measurements(measured, state)
     rows, shaft = linearise(exact, state)
