@@ -27,6 +27,9 @@ Status = Literal["ok", "weak", "unobservable", "solver_failed", "insufficient_da
 JOINT_OFFSET = "joint_offset "
 """How the name of a joint's offset among the nuisances begins; its column without the unit follows."""
 
+INTRINSICS = {"focal": "relative", "centre_x": "focal lengths", "centre_y": "focal lengths", "lens": "k1"}
+"""Corrections of a camera among the nuisances, `<name> <side>`, with units, in the order of `Camera.corrected`."""
+
 STATUS_SENTENCES: dict[str, str] = {
     "ok": "The result passed its own checks",
     "weak": "The data constrain the transform too loosely to be trusted",
@@ -192,6 +195,12 @@ class CalibrationResult:
             if name.startswith(JOINT_OFFSET)
         }
         return KinematicOffsets(joints, value("clock"), (value("rcm_offset[0]"), value("rcm_offset[1]")))
+
+    def intrinsic_correction(self, side: str) -> tuple[float, float, float, float]:
+        """What was found to be off in a camera (`right`, `left`), for `Camera.corrected`; zero where not estimated."""
+        entries = [self.nuisances.get(f"{name} {side}", {"value": 0.0}) for name in INTRINSICS]
+        focal, x, y, lens = (float(entry["value"]) for entry in entries)
+        return focal, x, y, lens
 
     @property
     def camera_left_T_arm(self) -> RigidTransform | None:

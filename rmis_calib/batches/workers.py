@@ -5,6 +5,7 @@ libraries with threads of their own are safe, and it ends when its parent does, 
 """
 
 import contextlib
+import math
 import multiprocessing
 import os
 import signal
@@ -78,7 +79,7 @@ class _Worker:
         self.stopped_for: str | None = None
 
     def give(self, index: int, task: Any, attempt: int) -> None:
-        self.task, self.attempt, self.since_s = index, attempt, time.monotonic()
+        self.task, self.attempt, self.since_s = index, attempt, math.inf
         self.connection.send((task,))
 
     def stop_if_late(self) -> None:
@@ -150,6 +151,9 @@ def run_tasks(
                         line.append((worker.task, worker.attempt + 1))
                     else:
                         yield Event(worker.task, "died", why, worker.attempt, worker.number)
+                    continue
+                if kind == "begun":  # a new process has loaded its libraries before
+                    worker.since_s = time.monotonic()
                     continue
                 index, attempt = worker.task, worker.attempt
                 assert index is not None
@@ -231,6 +235,7 @@ def _work(connection: Connection, function: Callable[[Any, Report], Any], limits
             return
         if given is None:
             return
+        connection.send(("begun", None))
         value = function(given[0], _Reporter(connection))
         connection.send(("finished", value))
 

@@ -93,6 +93,8 @@ def conclude(result: "CalibrationResult", written: Path) -> int:
 
 def result_rows(result: "CalibrationResult") -> list[tuple[str, str]]:
     """The answer with frames, units and uncertainty."""
+    from rmis_calib.results import INTRINSICS
+
     rows: list[tuple[str, str]] = []
     transform = result.camera_right_T_arm
     if transform is not None:
@@ -109,7 +111,8 @@ def result_rows(result: "CalibrationResult") -> list[tuple[str, str]]:
         if residual["median"] is not None:
             rows.append((f"residual, {kind.replace('_', ' ')}", f"median {residual['median']:.3g} {residual['unit']}"))
     for name, nuisance in result.nuisances.items():
-        if name.startswith("edge_bias"):  # eight hundredths of a pixel: for result.json and the report
+        # Hundredths of a pixel, and corrections that are said in words where they matter: for result.json and report.
+        if name.startswith("edge_bias") or name.partition(" ")[0] in INTRINSICS:
             continue
         sigma = "" if nuisance["sigma"] is None else f" +- {nuisance['sigma']:.2g}"
         held = " (held by its prior)" if nuisance.get("held") else ""

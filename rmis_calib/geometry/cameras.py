@@ -94,6 +94,18 @@ class Camera:
         values = (self.fx, self.fy, self.cx, self.cy, self.distortion)
         return Camera(*(value.to(dtype=dtype, device=device) for value in values), image_size=self.image_size)
 
+    def corrected(self, focal: float, centre_x: float, centre_y: float, lens: float) -> "Camera":
+        """The camera whose undistorted points are `corrected_points` of this one's, to first order.
+
+        Args:
+            focal: relative change of the points' scale: the focal length falls by it.
+            centre_x, centre_y: shift of the points, in focal lengths.
+            lens: growth of the points by r^2 times this: k1 falls by it.
+        """
+        fx, fy = self.fx / (1.0 + focal), self.fy / (1.0 + focal)
+        distortion = self.distortion - lens * torch.eye(5, dtype=self.fx.dtype, device=self.fx.device)[0]
+        return Camera(fx, fy, self.cx - centre_x * fx, self.cy - centre_y * fy, distortion, self.image_size)
+
     def distort(self, xy: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
         """Distorted normalised coordinates. Meaningful where `can_distort` holds."""
         k1, k2, p1, p2, k3 = self.distortion.unbind(-1)
@@ -195,6 +207,14 @@ def _inverse_2x2(matrix: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 2
     det = torch.where(det.abs() < 1e-6, torch.where(det < 0, -1e-6, 1e-6).to(det.dtype), det)
     adjugate = torch.stack([d, -b, -c, a], dim=-1).unflatten(-1, (2, 2))
     return adjugate / det[..., None, None]
+
+
+def corrected_points(
+    xy: Float[Tensor, "*batch 2"], focal: float, centre_x: float, centre_y: float, lens: float
+) -> Float[Tensor, "*batch 2"]:
+    """Undistorted points of a camera as `Camera.corrected` would have them, to first order."""
+    scale = focal + lens * xy.square().sum(-1, keepdim=True)
+    return xy * (1.0 + scale) + xy.new_tensor([centre_x, centre_y])
 
 
 @dataclass(frozen=True, eq=False)

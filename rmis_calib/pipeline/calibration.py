@@ -76,7 +76,7 @@ def run_calibration(
     run = _choose_again(run, _without_joint_offsets(config), several, progress)
     run = _with_joint_offsets(run, config, progress)
     progress("checking", 0, 1)
-    run = with_misfit_named(run, config)
+    run = with_misfit_named(run, config, lambda: _with_cameras_as_given(run, config))
     run = run.with_notes((*recording.notes, *notes))
     run = with_next_motions(run, config)
     progress("checking", 1, 1)
@@ -162,6 +162,13 @@ def _with_joint_offsets(run: CalibrationRun, config: CalibrationConfig, progress
     if _without_joint_offsets(config) == config:
         return run
     return _solve(run.recording, config, run.views, run.poses, run.choices, progress, run.clock_s)
+
+
+def _with_cameras_as_given(run: CalibrationRun, config: CalibrationConfig) -> CalibrationRun:
+    """The same choice solved without corrections of the cameras."""
+    unknowns = replace(config.solver.unknowns, intrinsics=False)
+    plain = replace(config, solver=replace(config.solver, unknowns=unknowns))
+    return _solve(run.recording, plain, run.views, run.poses, run.choices, no_progress, run.clock_s)
 
 
 def _solve(

@@ -124,6 +124,7 @@ def head_point_errors(
     arm_p_head = transform_points(poses.arm_T_rcm.cpu(), poses.rcm_p_head.cpu())
     for name, (camera, camera_T_arm, uv) in views.items():
         predicted = np.full((recording.n_frames, 2), np.nan)
+        camera = camera.corrected(*result.intrinsic_correction(name))
         predicted[poses.frames] = camera.project(camera_T_arm.apply(arm_p_head))[0].numpy()
         errors[name] = np.full(recording.n_frames, np.nan)
         errors[name][points.frames] = np.linalg.norm(predicted[points.frames] - uv, axis=-1)

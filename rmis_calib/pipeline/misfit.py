@@ -4,6 +4,7 @@ A model that does not fit shows as noise larger than any robot's and camera's. T
 not move") it would send people to record again what is wrong in a file.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rmis_calib.config import CalibrationConfig
-from rmis_calib.geometry.cameras import Camera
+from rmis_calib.geometry.cameras import Camera, corrected_points
 from rmis_calib.pipeline.association import Choice
 from rmis_calib.pipeline.observations import ANOTHER_INSTRUMENT
 from rmis_calib.pipeline.offset_unknowns import KinematicUnknowns, poses_at_motions
@@ -36,28 +37,40 @@ _TELLING = (SolveStatus.CONVERGED, SolveStatus.SINGULAR, SolveStatus.NON_FINITE)
 """How a solve can end that says nothing against the model by itself."""
 
 
-def with_misfit_named(run: CalibrationRun, config: CalibrationConfig) -> CalibrationRun:
-    """The run; a result that is not trustworthy as pictures and joints do not fit says so first, with the causes."""
+def with_misfit_named(
+    run: CalibrationRun, config: CalibrationConfig, plainly: Callable[[], CalibrationRun]
+) -> CalibrationRun:
+    """The run; a result that is not trustworthy as pictures and joints do not fit says so first, with the causes.
+
+    Args:
+        run: to look at.
+        config: of the calibration.
+        plainly: solves the same with the cameras as given: where nothing fits, corrections of cameras hide the cause.
+    """
     result, solution = run.result, run.solution
     if solution is None or result.camera_right_T_arm is None or result.trustworthy:
         return run
     if SolveStatus(int(solution.status)) in _TELLING and not is_misfit(result):
         return run
+    kept, run = run, plainly()
+    if run.solution is None or run.result.camera_right_T_arm is None:
+        run = kept
     unknowns = KinematicUnknowns(run.recording, run.poses.frames, config.device)
     found = [view.at(run.poses.frames) for view in run.views]
     moved = None
     if unknowns.has_clock:
-        at = poses_at_motions(unknowns, run.poses, result.kinematic_offsets, VELOCITY_STEP_S)
+        at = poses_at_motions(unknowns, run.poses, run.result.kinematic_offsets, VELOCITY_STEP_S)
         moved = replace(run, poses=at)
     parts = []
     for view, detections, choice in zip(run.views, found, run.choices, strict=True):
         now = run.predicted_contours(view)
         if now is not None and view.camera is not None:
             later = None if moved is None else moved.predicted_contours(view)
-            parts.append(signed_residuals(detections, choice, now, later, VELOCITY_STEP_S, view.camera))
+            off = run.result.intrinsic_correction(view.side)
+            parts.append(signed_residuals(detections, choice, now, later, VELOCITY_STEP_S, view.camera, off))
     repeated = sum(reason == FrameReason.REPEATED.sentence for reason in result.motions.reasons)
     causes = likely_causes(joined_residuals(parts), _disparity(run, found), repeated) if parts else []
-    return replace(run, result=replace(result, message=misfit_message(result, causes)))
+    return replace(kept, result=replace(result, message=misfit_message(result, causes)))
 
 
 def _disparity(run: CalibrationRun, found: list[ShaftDetections]) -> float | None:
@@ -154,6 +167,7 @@ def signed_residuals(
     predicted_later: Float[Tensor, "m 2 3"] | None,
     later_s: float,
     camera: Camera,
+    off: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0),
 ) -> SignedResiduals:
     """Residuals of one camera.
 
@@ -164,9 +178,11 @@ def signed_residuals(
         predicted_later: the same `later_s` later; None where the joints' velocity is not known.
         later_s: seconds.
         camera: for its focal length.
+        off: correction of the camera that the prediction counts on.
     """
     rows = torch.arange(len(choice.candidate), device=choice.candidate.device)
     middle = found.axis_xy[rows, choice.candidate.clamp_min(0)].double().mean(1)  # (m, 2)
+    middle = corrected_points(middle, *off)
     focal = float(camera.focal)
     now = _distance(predicted, middle)
     velocity = torch.full_like(now, torch.nan)

@@ -14,7 +14,15 @@ from rmis_calib.pipeline.association import (
 from rmis_calib.pipeline.detection import View
 from rmis_calib.pipeline.observations import reasons_for
 from rmis_calib.pipeline.poses import MotionPoses
-from rmis_calib.results import JOINT_OFFSET, STATUS_SENTENCES, CalibrationResult, Information, Motions, Status
+from rmis_calib.results import (
+    INTRINSICS,
+    JOINT_OFFSET,
+    STATUS_SENTENCES,
+    CalibrationResult,
+    Information,
+    Motions,
+    Status,
+)
 from rmis_calib.robot import split_joint_column
 from rmis_calib.solver import Solution, SolveStatus
 from rmis_calib.solver.observability import Observability
@@ -25,6 +33,8 @@ JOINTS_UNKNOWN = "the joint log does not cover this time"
 TOO_FEW = "usable, but there are too few"
 OTHER_TOOL_MM = 25.0
 """Distance of the shaft's end from its nominal place that no wrist explains: the metal of one is 5 to 20 mm long."""
+CORRECTED = 1.0
+"""Correction of a camera in prior sigmas from which it is said."""
 WORTH_SAYING = 1.25
 """Growth of sigma by disagreeing groups from which it is said."""
 OF_ONE_RECORDING = ("clock", "joint_offset", "rcm_offset")
@@ -56,7 +66,8 @@ def make_result(
         camera_left_T_camera_right=None if stereo is None else _transform("camera_left", "camera_right", stereo),
         covariance=covariance if np.isfinite(covariance).all() else None,
         observability=observability_record(
-            solution.observability.describe(), (*notes, *_about_tool(solution), *about_groups(consistency))
+            solution.observability.describe(),
+            (*notes, *_about_tool(solution), *about_groups(consistency), *about_cameras(solution)),
         ),
         motions=motions,
         residuals=residuals,
@@ -168,6 +179,9 @@ def _nuisance_records(solution: Solution, joint_columns: tuple[str, ...]) -> dic
         for index, (value, sigma, is_held) in enumerate(zip(values, sigmas, held, strict=True)):
             key = name if len(values) == 1 else f"{name}[{index}]"
             unit = nuisance.unit
+            if name == "intrinsics":
+                what, unit = list(INTRINSICS.items())[index % len(INTRINSICS)]
+                key = f"{what} {('right', 'left')[index // len(INTRINSICS)]}"
             if name == "joint_offset":
                 joint, unit = split_joint_column(joint_columns[index])
                 key = f"{JOINT_OFFSET}{joint}"
@@ -222,6 +236,29 @@ def about_groups(consistency: dict[str, Any] | None) -> tuple[str, ...]:
         f"{grown:.1f} times. Most of all the {group['motions']} motions {where}: without them the answer moves by "
         f"{group['rotation_deg']:.2g} deg, {group['translation_mm']:.2g} mm.",
     )
+
+
+def about_cameras(solution: Solution) -> tuple[str, ...]:
+    """Corrections of the cameras that are larger than their priors, in words."""
+    found = solution.nuisances.get("intrinsics")
+    if found is None:
+        return ()
+    said = []
+    for camera, (values, pulls) in enumerate(
+        zip(found.value.reshape(-1, 4).tolist(), found.pull.reshape(-1, 4).tolist(), strict=True)
+    ):
+        focal, x, y, lens = values
+        parts = [
+            (pulls[0], f"the focal length by {-100.0 * focal:+.1f} %"),
+            (max(pulls[1], pulls[2], key=abs), f"the principal point by {-100.0 * x:+.2f}, {-100.0 * y:+.2f} % of it"),
+            (pulls[3], f"k1 by {-lens:+.3f}"),
+        ]
+        changed = [words for pull, words in parts if abs(pull) > CORRECTED]
+        if changed:
+            said.append(f"of the {('right', 'left')[camera]} camera {', '.join(changed)}")
+    if not said:
+        return ()
+    return (f"The pictures ask for other cameras: {'; '.join(said)}. The transform belongs to the corrected ones.",)
 
 
 def ranges_in_words(numbers: list[int], most: int = 4) -> str:

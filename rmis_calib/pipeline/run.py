@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from jaxtyping import Float
 from torch import Tensor
 
+from rmis_calib.geometry.cameras import Camera
 from rmis_calib.io import Recording, ShaftObservations
 from rmis_calib.pipeline.association import Choice
 from rmis_calib.pipeline.detection import View
@@ -44,6 +45,10 @@ class CalibrationRun:
         """Clock offset that was found; None where it is no unknown or the data cannot tell it."""
         clock = None if self.solution is None else self.solution.nuisances.get("clock")
         return None if clock is None or bool(clock.held) else float(clock.value)
+
+    def camera(self, view: View) -> Camera | None:
+        """A view's camera, corrected by what was found to be off in it."""
+        return None if view.camera is None else view.camera.corrected(*self.result.intrinsic_correction(view.side))
 
     def predicted_contours(self, view: View) -> Float[Tensor, "m 2 3"] | None:
         """Contour planes where the result puts the shaft, in one view's camera."""

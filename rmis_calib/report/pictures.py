@@ -63,11 +63,12 @@ def _overlay(
             # On the axis, as the prediction is: the rim that is seen lies in front of it, several px further along.
             end = torch.nn.functional.pad(detections.end_xy[frame, candidate].double().cpu(), (0, 1), value=1.0)
             draw_dot(canvas, view.camera.project(end)[0].numpy(), DETECTED_RGB, 2 * thickness)
-    if contour_n is not None and view.camera is not None:
-        for polyline in contour_polylines(contour_n, view.camera):
+    camera = run.camera(view)
+    if contour_n is not None and camera is not None:
+        for polyline in contour_polylines(contour_n, camera):
             draw_polyline(canvas, polyline, PREDICTED_RGB, max(1, thickness - 1))
-    if camera_p_end is not None and view.camera is not None:
-        uv, visible = view.camera.project(camera_p_end.cpu())
+    if camera_p_end is not None and camera is not None:
+        uv, visible = camera.project(camera_p_end.cpu())
         if bool(visible):
             draw_dot(canvas, uv.numpy(), PREDICTED_RGB, thickness)
     used = bool(run.result.motions.used[frame])

@@ -218,19 +218,17 @@ def test_solve_refuses_a_broken_npz(tmp_path, capsys):
     assert not (tmp_path / "r.json").exists()
 
 
-def test_interrupted_run_leaves_no_result(rendered_pairs, tmp_path):
-    """Ctrl-C while frames are being detected."""
+def test_interrupted_run_leaves_no_result(tmp_path):
+    """Ctrl-C while a long recording is being rendered."""
     out = tmp_path / "out"
     command = [
         sys.executable,
         "-m",
         "rmis_calib",
-        "calibrate",
-        str(rendered_pairs),
-        "--out",
+        "synth",
         str(out),
-        "--batch-size",
-        "1",
+        "--motions",
+        "1000",
     ]
     with subprocess.Popen(
         command, stderr=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"}
@@ -238,7 +236,7 @@ def test_interrupted_run_leaves_no_result(rendered_pairs, tmp_path):
         assert process.stderr is not None
         seen = ""
         deadline = time.monotonic() + 120
-        while "detecting" not in seen and time.monotonic() < deadline:
+        while "rendering" not in seen and time.monotonic() < deadline:
             seen += process.stderr.readline()
         process.send_signal(signal.SIGINT)
         rest = process.communicate(timeout=60)[1]

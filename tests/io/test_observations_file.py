@@ -39,6 +39,9 @@ def everything() -> dict[str, Any]:
         "rcm_p_head": 160 + generator.normal(size=(N, 3)),
         "sigma_image": 1e-3,
         "sigma_edge_bias": 3e-5,
+        "sigma_focal": 0.005,
+        "sigma_centre": 0.003,
+        "sigma_lens": 0.03,
         "unknown_names": np.array(["laparoscope.yaw_rad", "instrument.insertion_mm", "clock_s"]),
         "unknown_displacement": generator.normal(size=(N, 3, 6)),
         "unknown_at": np.array([0.001, 0.1, 0.02]),
@@ -344,6 +347,7 @@ def test_unwritable_output(tmp_path: Path) -> None:
     [
         ("sigma_image", 0.3, "sigma_image: looks like pixels; divide by the focal length"),
         ("sigma_edge_bias", 0.2, "sigma_edge_bias: looks like pixels"),
+        ("sigma_centre", 3.0, "sigma_centre: looks like pixels"),
         ("sigma_axis_right", np.full(N, 0.4), "sigma_axis_right: looks like pixels"),
         ("sigma_kinematics_rad", 0.1, "sigma_kinematics_rad: looks like degrees; multiply by pi / 180"),
         ("sigma_stereo_rad", 0.5, "sigma_stereo_rad: looks like degrees"),

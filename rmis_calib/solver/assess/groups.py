@@ -17,9 +17,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from rmis_calib.solver.assess.information import inverse
 from rmis_calib.solver.estimate.map_estimate import MapEstimate
 from rmis_calib.solver.estimate.outliers import REJECTED
-from rmis_calib.solver.model.batched_linalg import rescaled, unit_diagonal
+from rmis_calib.solver.model.batched_linalg import unit_diagonal
 from rmis_calib.solver.model.measurement_rows import MeasurementRows
 from rmis_calib.solver.model.normal_equations import group_sums
 from rmis_calib.solver.solution import GroupCheck
@@ -35,6 +36,12 @@ LEVER_MM = 100.0
 LLOYD_ROUNDS = 12
 CLEAR = 0.99
 """Quantile of chance beyond which a single direction, or a single group, is said to disagree."""
+TINY = 1e-20
+"""Variance, rad^2 or mm^2, below which a direction is none: the inverse has left it out."""
+HARDLY_SEEN = 40.0
+"""Variance of a difference of two parts, in that of the answer of all, from which a direction does not count."""
+LARGEST = 1e9
+"""Squared sigmas beyond which nothing differs any more."""
 _RIDGE = 0.02
 """In units of the covariance: a direction that no group moves (it is the prior's) counts as agreeing."""
 
@@ -68,21 +75,26 @@ def check_groups(fit: MapEstimate, asked: int) -> GroupCheck:
             inflation=torch.ones_like(like[:, 0]),
         )
     group = neighbours(where_motions_are(measured), used, count)
-    H_k, s_k = group_sums(fit.model, state, group, count)  # (b, k, p, p), (b, k, p)
+    H_k, s_k = map(torch.nan_to_num, group_sums(fit.model, state, group, count))  # (b, k, p, p), (b, k, p)
     prior = fit.model.layout.sigma.square().reciprocal()
     H = H_k.sum(1) + torch.diag_embed(prior)
     deviation, _ = fit.model.layout.prior(state)
     s_k = s_k - (s_k.sum(1) + prior * deviation)[:, None] / count  # what the bias correction left of the score
     shift, covariance_k, covariance = _left_out(H, H_k, s_k)
+    told = torch.isfinite(shift).flatten(1).all(-1) & (covariance.diagonal(dim1=-2, dim2=-1) > TINY).all(-1)
+    enough = enough & told
+    covariance = torch.where(told[:, None, None], covariance, eye)
+    covariance_k = torch.where(told[:, None, None, None], covariance_k, eye[:, None])
+    shift = torch.where(told[:, None, None], shift, 0.0)
     root, inverse_root = _roots(covariance)
     own = shift @ inverse_root.mT  # (b, k, 6)
     extra = inverse_root[:, None] @ (covariance_k - covariance[:, None]) @ inverse_root[:, None].mT
-    expected = extra.sum(1) + _RIDGE * eye
-    found = own.mT @ own + _RIDGE * eye
+    expected = _bounded(extra.sum(1)) + _RIDGE * eye
+    found = _bounded(own.mT @ own) + _RIDGE * eye
     E_values, E_vectors = torch.linalg.eigh(expected)
-    narrow = E_vectors * E_values.rsqrt()[:, None] @ E_vectors.mT
+    narrow = E_vectors * E_values.clamp_min(_RIDGE).rsqrt()[:, None] @ E_vectors.mT
     W = narrow @ found @ narrow
-    values, vectors = torch.linalg.eigh(0.5 * (W + W.mT))
+    values, vectors = torch.linalg.eigh(_bounded(0.5 * (W + W.mT)))
     # The mean of all directions is known to a fifth with eight groups; a single direction counts only where it is
     # beyond what the largest of six directions reaches by chance.
     mean = values.mean(-1, keepdim=True).clamp_min(1.0)
@@ -90,8 +102,8 @@ def check_groups(fit: MapEstimate, asked: int) -> GroupCheck:
     factor = torch.where(enough[:, None], factor, 1.0)
     growth = root @ (vectors * factor.sqrt()[:, None] @ vectors.mT) @ inverse_root
     first_half = _first_half(where_motions_are(measured), group, count)
-    halves, apart = _difference(H_k, s_k, prior, deviation, first_half[:, None], growth)
-    changes, change_apart = _changes_in_time(fit, growth, count)
+    halves, apart = _difference(H_k, s_k, prior, deviation, first_half[:, None], growth, inverse_root)
+    changes, change_apart = _changes_in_time(fit, growth, inverse_root, count)
     clearest = change_apart.argmax(-1)
     sigmas = torch.linalg.solve(extra + _RIDGE * eye[:, None], own[..., None])[..., 0]
     return GroupCheck(
@@ -157,7 +169,7 @@ def _first_half(place: Float[Tensor, "b n d"], group: Int[Tensor, "b n"], count:
 
 
 def _changes_in_time(
-    fit: MapEstimate, growth: Float[Tensor, "b 6 6"], count: int
+    fit: MapEstimate, growth: Float[Tensor, "b 6 6"], inverse_root: Float[Tensor, "b 6 6"], count: int
 ) -> tuple[Float[Tensor, "b s 6"], Float[Tensor, "b s"]]:
     """Difference of what comes before and after each border of `count` consecutive blocks, and in sigmas.
 
@@ -173,11 +185,11 @@ def _changes_in_time(
     )
     mostly = (share > 0.5).any(0).to(weight.dtype) @ member.T > 0.5  # (b, n)
     model = fit.model if fit.model.weight is None else replace(fit.model, weight=torch.where(mostly, 1.0, weight))
-    H_k, s_k = group_sums(model, fit.state, block.expand(b, -1), count)
+    H_k, s_k = map(torch.nan_to_num, group_sums(model, fit.state, block.expand(b, -1), count))
     prior = fit.model.layout.sigma.square().reciprocal()
     deviation, _ = fit.model.layout.prior(fit.state)
     before = torch.tril(torch.ones(count - 1, count, dtype=weight.dtype, device=weight.device))
-    return _difference(H_k, s_k, prior, deviation, before.expand(b, -1, -1), growth)
+    return _difference(H_k, s_k, prior, deviation, before.expand(b, -1, -1), growth, inverse_root)
 
 
 def _first_of_block(motions: int, count: int, like: Tensor) -> Int[Tensor, " k"]:
@@ -193,24 +205,29 @@ def _difference(
     deviation: Float[Tensor, "b p"],
     first: Float[Tensor, "b s k"],
     growth: Float[Tensor, "b 6 6"],
+    inverse_root: Float[Tensor, "b 6 6"],
 ) -> tuple[Float[Tensor, "b s 6"], Float[Tensor, "b s"]]:
     """How far the answers of two parts of the data are apart, one Gauss-Newton step each from that of all, and in their
     grown sigmas.
 
     Args:
         first: 1 for the groups of the first part, 0 for those of the other; `s` ways to part them.
+        growth: of covariances.
+        inverse_root: what makes the covariance of all the identity.
     """
-    estimates = []
+    steps, variances = [], []
     for part in (first, 1.0 - first):
         H = torch.einsum("bsk,bkpq->bspq", part, H_k) + torch.diag_embed(prior)[:, None]
-        g = part @ s_k + (prior * deviation)[:, None]
-        _, scale = unit_diagonal(H)
-        inverse = rescaled(torch.linalg.pinv(rescaled(H, scale), hermitian=True, rtol=1e-13), scale)
-        covariance = growth[:, None] @ inverse[..., :6, :6] @ growth[:, None].mT
-        estimates.append((-(inverse @ g[..., None])[..., :6, 0], covariance))
-    gap = estimates[0][0] - estimates[1][0]
-    _, narrow = _roots(estimates[0][1] + estimates[1][1])
-    return gap, (narrow @ gap[..., None])[..., 0].norm(dim=-1)
+        C = inverse(H)
+        steps.append(-(C @ (part @ s_k + (prior * deviation)[:, None])[..., None])[..., :6, 0])
+        variances.append(inverse_root[:, None] @ C[..., :6, :6] @ inverse_root[:, None].mT)
+    gap = steps[0] - steps[1]
+    # The growth takes both covariances and the unit that they are measured in along, so that it acts on the gap alone.
+    own = gap @ (inverse_root @ torch.linalg.inv(growth)).mT
+    values, vectors = torch.linalg.eigh(_bounded(variances[0] + variances[1]))
+    along = (vectors.mT @ _bounded(own)[..., None])[..., 0].square() / values.clamp_min(_RIDGE)
+    # A part that hardly sees a direction has little to say of it, and noise in its Jacobian looks like sight.
+    return gap, torch.where(values < HARDLY_SEEN, along, 0.0).sum(-1).sqrt()
 
 
 def _measured(measured: MeasurementRows) -> Tensor:
@@ -218,17 +235,18 @@ def _measured(measured: MeasurementRows) -> Tensor:
     return torch.stack([measured.rows_ok[cameras == c].any(0) for c in range(measured.cameras)])
 
 
+def _bounded(matrix: Tensor) -> Tensor:
+    """The matrix without what eigenvalue routines choke on; where it matters the answer is none anyway."""
+    return torch.nan_to_num(matrix, nan=0.0, posinf=LARGEST, neginf=-LARGEST).clamp(-LARGEST, LARGEST)
+
+
 def _left_out(
     H: Float[Tensor, "b p p"], H_k: Float[Tensor, "b k p p"], s_k: Float[Tensor, "b k p"]
 ) -> tuple[Float[Tensor, "b k 6"], Float[Tensor, "b k 6 6"], Float[Tensor, "b 6 6"]]:
     """Of the transform: its shift without each group, its covariance then, and that of all."""
-    _, scale = unit_diagonal(H)
-    rest = rescaled(H[:, None] - H_k, scale[:, None])
-    inverse = torch.linalg.pinv(rest, hermitian=True, rtol=1e-13)
-    shift = (inverse @ (s_k * scale[:, None])[..., None])[..., 0] * scale[:, None]
-    covariance_k = rescaled(inverse, scale[:, None])
-    covariance = rescaled(torch.linalg.pinv(rescaled(H, scale), hermitian=True, rtol=1e-13), scale)
-    return shift[..., :6], covariance_k[..., :6, :6], covariance[..., :6, :6]
+    rest = inverse(H[:, None] - H_k)
+    shift = (rest @ s_k[..., None])[..., :6, 0]
+    return shift, rest[..., :6, :6], inverse(H)[..., :6, :6]
 
 
 def _roots(matrix: Float[Tensor, "*b 6 6"]) -> tuple[Float[Tensor, "*b 6 6"], Float[Tensor, "*b 6 6"]]:
