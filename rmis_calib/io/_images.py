@@ -1,7 +1,9 @@
 """A folder of images as a source of frames. OpenCV decodes cut-off files without a word, so they are checked first."""
 
+import contextlib
 import re
 import struct
+import warnings
 import zlib
 from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
@@ -87,11 +89,25 @@ class ImageReader:
         except cv2.error:
             image = None
         if image is None:
+            _check_memory(path)
             raise VideoError(where=str(path), expected="an image", found="a file that cannot be decoded")
         if image.dtype not in (np.uint8, np.uint16):
             expected = "pictures of 8 to 16 bits a colour"
             raise VideoError(where=str(path), expected=expected, found=f"{image.dtype} numbers")
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def _check_memory(path: Path) -> None:
+    """Tell a picture that memory cannot hold from one that is no picture: the decoder says neither.
+
+    Raises:
+        MemoryError: it is larger than what is left.
+    """
+    with contextlib.suppress(OSError, ValueError, Image.DecompressionBombError), warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        with Image.open(path) as picture:
+            width, height = picture.size
+        bytearray(6 * width * height)  # the decoder's copy and ours
 
 
 def _class_numbers(path: Path) -> np.ndarray:

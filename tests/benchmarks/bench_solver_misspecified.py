@@ -73,10 +73,12 @@ def compliance(arrays: Arrays, _: np.random.Generator) -> Arrays:
 
 
 def rcm_moves(arrays: Arrays, _: np.random.Generator) -> Arrays:
-    """The pivot gives way by up to 1 mm to the side, with the instrument's direction."""
+    """The pivot gives way by up to 1 mm to the side, as a sine of the instrument's angles. (A give in proportion to the
+    direction is the same as a pivot elsewhere along the shaft, which no data can tell.)"""
     poses, v = arrays["arm_T_rcm"].copy(), arrays["rcm_v_axis"]
-    spread = v - v.mean(1, keepdims=True)
-    give = spread / np.abs(spread).max()
+    give = np.sin(
+        20.0 * np.stack((np.arctan2(v[..., 0], v[..., 2]), np.arctan2(v[..., 1], v[..., 2]), 0 * v[..., 0]), -1)
+    )
     poses[..., :3, 3] += (poses[..., :3, :3] @ give[..., None])[..., 0]
     return arrays | {"arm_T_rcm": poses}
 
