@@ -6,6 +6,9 @@ from pathlib import Path
 import pytest
 import torch
 
+# Threads that wait by spinning take the cores from the tests, and the programs, that run beside them.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 # One thread: the tests' tensors are small, and two cores are shared with decoding threads.
 torch.set_num_threads(int(os.environ.get("RMIS_CALIB_TEST_THREADS", "1")))
 

@@ -8,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -219,27 +220,24 @@ def test_solve_refuses_a_broken_npz(tmp_path, capsys):
 
 
 def test_interrupted_run_leaves_no_result(tmp_path):
-    """Ctrl-C while a long recording is being rendered."""
-    out = tmp_path / "out"
-    command = [
-        sys.executable,
-        "-m",
-        "rmis_calib",
-        "synth",
-        str(out),
-        "--motions",
-        "1000",
-    ]
+    """Ctrl-C while frames are being detected."""
+    pictures, out = tmp_path / "pictures", tmp_path / "out"
+    pictures.mkdir()
+    image = np.random.default_rng(0).integers(0, 255, (240, 320, 3), dtype=np.uint8)
+    cv2.imwrite(str(pictures / "0000.png"), image)
+    for number in range(1, 3000):
+        os.link(pictures / "0000.png", pictures / f"{number:04d}.png")
+    command = [sys.executable, "-m", "rmis_calib", "detect", str(pictures), "--out", str(out), "--overlays", "0"]
     with subprocess.Popen(
         command, stderr=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"}
     ) as process:
         assert process.stderr is not None
         seen = ""
         deadline = time.monotonic() + 120
-        while "rendering" not in seen and time.monotonic() < deadline:
+        while "detecting" not in seen and time.monotonic() < deadline:
             seen += process.stderr.readline()
         process.send_signal(signal.SIGINT)
         rest = process.communicate(timeout=60)[1]
     assert process.returncode == 130, seen + rest
     assert "interrupted" in rest
-    assert list(tmp_path.iterdir()) == []
+    assert list(tmp_path.iterdir()) == [pictures]

@@ -6,6 +6,7 @@ import pytest
 
 import rmis_calib as rc
 from rmis_calib.cli import main
+from rmis_calib.pipeline.evaluation import CHI_3_SIGMA
 
 
 @pytest.fixture(scope="module")
@@ -18,14 +19,16 @@ def calibrated(shared_data, tmp_path_factory):
 @pytest.mark.slow
 def test_real_recording_is_calibrated(calibrated, shared_data):
     code, out = calibrated
-    assert code == 0
     recording = shared_data / "recode_recording"
     result = rc.CalibrationResult.read(out / "result.json")
+    # A still camera whose intrinsics nobody vouches for is 3 to 4 mm off here: told to 3 mm, it is weak or just not.
+    assert (code, result.status) in ((0, "ok"), (1, "weak"))
     assert int(result.motions.used.sum()) >= 40
     evaluation = rc.evaluate(result, recording, recording / "reference.yaml")
     assert evaluation.head_point_error_px["right"]["median"] <= 8.0
     assert evaluation.rotation_error_deg <= 1.5
     assert evaluation.translation_error_mm <= 6.0
+    assert evaluation.error_sigmas <= CHI_3_SIGMA
 
 
 @pytest.mark.slow
