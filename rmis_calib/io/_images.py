@@ -104,7 +104,7 @@ def _check_memory(path: Path) -> None:
         MemoryError: it is larger than what is left.
     """
     with contextlib.suppress(OSError, ValueError, Image.DecompressionBombError), warnings.catch_warnings():
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        warnings.simplefilter("ignore")
         with Image.open(path) as picture:
             width, height = picture.size
         bytearray(6 * width * height)  # the decoder's copy and ours

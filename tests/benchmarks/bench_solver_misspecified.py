@@ -73,8 +73,8 @@ def compliance(arrays: Arrays, _: np.random.Generator) -> Arrays:
 
 
 def rcm_moves(arrays: Arrays, _: np.random.Generator) -> Arrays:
-    """The pivot gives way by up to 1 mm to the side, as a sine of the instrument's angles. (A give in proportion to the
-    direction is the same as a pivot elsewhere along the shaft, which no data can tell.)"""
+    """The pivot gives way by up to 1 mm to the side, as a sine of the instrument's angles; within the 10 deg of these
+    scenes nearly in proportion to them, which is the same as a pivot elsewhere along the shaft: no data tell that."""
     poses, v = arrays["arm_T_rcm"].copy(), arrays["rcm_v_axis"]
     give = np.sin(
         20.0 * np.stack((np.arctan2(v[..., 0], v[..., 2]), np.arctan2(v[..., 1], v[..., 2]), 0 * v[..., 0]), -1)

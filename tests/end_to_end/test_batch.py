@@ -169,10 +169,10 @@ def test_killed_at_any_moment_a_batch_goes_on_to_the_same_summary(tree, tmp_path
     took_s = time.monotonic() - start
     moments = random.Random(0)
     killed = 0
-    for _ in range(2):
+    for _ in range(1):
         with subprocess.Popen([*command, str(tmp_path / "killed")], **quiet) as process:
             try:
-                process.wait(moments.uniform(0.3, 0.9) * took_s)
+                process.wait(moments.uniform(0.4, 0.7) * took_s)
             except subprocess.TimeoutExpired:
                 killed += 1
                 process.send_signal(signal.SIGKILL)
@@ -217,7 +217,9 @@ def test_results_of_one_set_up_are_pooled_and_shown(demo_output, tmp_path, capsy
     for name in ("monday", "tuesday"):
         shutil.copytree(demo_output / "recording", root / name)
     manifest = tmp_path / "list.yaml"
-    manifest.write_text("recordings: [{recording: root/monday, config: {every: 2}}, root/tuesday]\n")
+    manifest.write_text(
+        "recordings: [{recording: root/monday, config: {every: 3}}, {recording: root/tuesday, config: {every: 2}}]\n"
+    )
     assert main(["batch", str(manifest), "--out", str(out), "--overlay-video", "--profile", "--overlays", "0"]) == 0
     assert "The 2 results agree within their sigmas" in capsys.readouterr().out
     raw = json.loads((out / "summary.json").read_text())
@@ -226,7 +228,7 @@ def test_results_of_one_set_up_are_pooled_and_shown(demo_output, tmp_path, capsy
     assert setup["recordings"] == ["monday", "tuesday"]
     assert setup["camera_right_T_arm"]["matrix"][3] == [0.0, 0.0, 0.0, 1.0]
     rows = {row["name"]: row for row in raw["recordings"]}
-    assert rows["monday"]["motions_used"] <= 30 < rows["tuesday"]["motions_used"]
+    assert rows["monday"]["motions_used"] <= 20 < rows["tuesday"]["motions_used"] <= 30
     page = (out / "index.html").read_text()
     assert "All 2 recordings can be trusted" in page and "<svg" in page and "data:image/jpeg" in page
     import av
