@@ -120,8 +120,8 @@ def _strange_unknown(solution: Solution) -> str:
         return ""
     if worst == "intrinsics":
         return (
-            f"focal length, centre or lens of a camera are estimated {pulls[worst]:.0f} prior sigmas from what the file "
-            "says: is it of another picture size, a crop, or without its lens model, or the clock off?"
+            f"focal length, centre or lens of a camera are estimated {pulls[worst]:.0f} prior sigmas from what the "
+            "file says: is it of another picture size, a crop, or without its lens model, or the clock off?"
         )
     where = f"the {worst.replace('_', ' ')} is estimated {pulls[worst]:.0f} prior sigmas from its nominal value"
     return f"{where}: are the cameras swapped, is a unit or a file wrong, or the clock off?"
