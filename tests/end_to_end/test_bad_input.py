@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -229,7 +230,11 @@ def test_interrupted_run_leaves_no_result(tmp_path):
         os.link(pictures / "0000.png", pictures / f"{number:04d}.png")
     command = [sys.executable, "-m", "rmis_calib", "detect", str(pictures), "--out", str(out), "--overlays", "0"]
     with subprocess.Popen(
-        command, stderr=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"}
+        command,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONUNBUFFERED": "1"},
+        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),  # a shell's background jobs ignore it
     ) as process:
         assert process.stderr is not None
         seen = ""
