@@ -192,25 +192,29 @@ def _text_entries(manifest: Path) -> Iterator[_Entry]:
 
 def _csv_entries(manifest: Path) -> Iterator[_Entry]:
     rows = csv.DictReader(_text(manifest).splitlines())
-    if "recording" not in (rows.fieldnames or ()):
-        found = ", ".join(rows.fieldnames or ()) or "none"
-        raise InputError(where=f"{manifest}, line 1", expected="a column called recording", found=found)
+    columns = rows.fieldnames or ()
+    if "recording" not in columns or len(set(columns)) < len(columns):
+        expected, found = "columns of different names and a column called recording", ", ".join(columns) or "none"
+        raise InputError(where=f"{manifest}, line 1", expected=expected, found=found)
     for row in rows:
         where = f"{manifest}, line {rows.line_num}"
         if None in row or None in row.values():
-            raise InputError(where=where, expected=f"{len(rows.fieldnames or ())} values", found="another number")
+            raise InputError(where=where, expected=f"{len(columns)} values", found="another number")
         settings = {key: value for key, value in row.items() if key not in ("recording", "name", "config") and value}
         preset = row.get("config") or None
         if preset and settings:
             expected = "a config file or settings in columns of their own"
             raise InputError(where=where, expected=expected, found="both")
+        group = next((key for key in settings if any(other.startswith(f"{key}.") for other in settings)), None)
+        if group is not None:
+            expected = "a setting or settings of a group, not both"
+            raise InputError(where=where, expected=expected, found=f"{group} and settings below it")
         nested: dict[str, Any] = {}
         for key, value in settings.items():
-            *groups, last = key.split(".")
-            place = nested
-            for group in groups:
-                place = place.setdefault(group, {})
-            place[last] = yaml_value(value)
+            own: Any = yaml_value(value)
+            for part in reversed(key.split(".")):
+                own = {part: own}
+            nested = _merged(nested, own)
         yield _Entry(row["recording"], row.get("name") or None, preset or nested or None, where)
 
 
@@ -226,8 +230,9 @@ def _yaml_entries(manifest: Path) -> Iterator[_Entry]:
             yield _Entry(item, None, None, where)
             continue
         known = {"recording", "name", "config"}
-        if not isinstance(item, dict) or not isinstance(item.get("recording"), str) or set(item) - known:
-            expected = "a path, or a mapping with recording and, if wanted, name and config"
+        is_text = isinstance(item, dict) and all(isinstance(item.get(key, ""), str) for key in ("recording", "name"))
+        if not is_text or "recording" not in item or set(item) - known:
+            expected = "a path, or a mapping with recording and, if wanted, name (words, not numbers) and config"
             raise InputError(where=where, expected=expected, found=str(item)[:80])
         yield _Entry(item["recording"], item.get("name"), item.get("config"), where)
 
