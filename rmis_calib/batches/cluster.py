@@ -7,9 +7,10 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
-from rmis_calib.batches.workers import Event, Limits, Report
+from rmis_calib.batches.workers import Event, Limits, Report, Throttled
 from rmis_calib.errors import InputError
 
 TOPIC = "rmis-calib-progress"
@@ -41,61 +42,78 @@ def run_tasks(
     Raises:
         InputError: dask.distributed is not installed, or no scheduler answers.
     """
-    try:
-        import dask
-        from distributed import Client, LocalCluster
-        from distributed.client import Future
-        from distributed.scheduler import KilledWorker
-    except ImportError as error:
-        expected = "dask.distributed (pip install 'rmis-calib[cluster]')"
-        raise InputError(where="--cluster", expected=expected, found="not installed") from error
-    with dask.config.set({"distributed.scheduler.allowed-failures": limits.retries}):
-        cluster = None
-        if address == "local":
-            cluster = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=":0", silence_logs=50)
-        try:
-            client = Client(cluster if cluster is not None else address, timeout="20s", set_as_default=False)
-        except (OSError, ValueError, TimeoutError) as error:
-            if cluster is not None:
-                cluster.close()
-            expected = "a dask scheduler that answers (tcp://host:8786), or local"
-            raise InputError(where=f"--cluster {address}", expected=expected, found="none") from error
-    messages: deque[tuple[int, tuple[str, int, int]]] = deque()
-    futures: dict[Future, int] = {}
-    seen: set[int] = set()
-    try:
+    with _connected(address, workers, limits.retries) as client:
+        messages: deque[tuple[int, tuple[str, int, int]]] = deque()
         client.subscribe_topic(TOPIC, lambda event: messages.append((event[1]["index"], tuple(event[1]["value"]))))
+        futures: dict[Any, int] = {}
         for index, task in enumerate(tasks):
             # Keys of their own: a task that was done for another client must be done again for this one.
             key = f"rmis-calib-{socket.gethostname()}-{time.time_ns()}-{index}"
             future = client.submit(_on_worker, function, index, task, limits.threads, key=key, pure=False)
             futures[future] = index
-        while futures:
-            if stop():
-                waiting = [future for future, index in futures.items() if index not in seen]
-                client.cancel(waiting)
-                futures = {future: index for future, index in futures.items() if index in seen}
-            time.sleep(0.05 if any(future.done() for future in futures) else _WAIT_S)
-            while messages:
-                index, value = messages.popleft()
-                if index not in seen:
-                    seen.add(index)
-                    yield Event(index, "started", None, 1, 0)
-                yield Event(index, "progress", value, 1, 0)
-            for future in [future for future in futures if future.done()]:
-                index = futures.pop(future)
-                if future.status == "finished":
-                    yield Event(index, "finished", future.result(), 1, 0)
-                else:
-                    error = future.exception() if future.status == "error" else None
-                    is_dead = isinstance(error, KilledWorker)
-                    why = "every worker that took it died" if is_dead else f"the cluster gave it up: {error!r}"
-                    yield Event(index, "died", why, limits.retries + 1, 0)
-    finally:
-        client.cancel(list(futures))
-        client.close()
-        if cluster is not None:
-            cluster.close()
+        try:
+            yield from _events(client, futures, messages, limits.retries, stop)
+        finally:
+            client.cancel(list(futures))
+
+
+@contextmanager
+def _connected(address: str, workers: int, retries: int) -> Iterator[Any]:
+    """A client of the scheduler, and where it is `local` the cluster itself."""
+    try:
+        import dask
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        expected = "dask.distributed (pip install 'rmis-calib[cluster]')"
+        raise InputError(where="--cluster", expected=expected, found="not installed") from error
+    with ExitStack() as stack:
+        at: Any = address
+        if address == "local":
+            with dask.config.set({"distributed.scheduler.allowed-failures": retries}):
+                at = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=":0", silence_logs=50)
+            stack.callback(at.close)
+        try:
+            client = Client(at, timeout="20s", set_as_default=False)
+        except (OSError, ValueError, TimeoutError) as error:
+            expected = "a dask scheduler that answers (tcp://host:8786), or local"
+            raise InputError(where=f"--cluster {address}", expected=expected, found="none") from error
+        stack.callback(client.close)
+        yield client
+
+
+def _events(
+    client: Any,
+    futures: dict[Any, int],
+    messages: deque[tuple[int, tuple[str, int, int]]],
+    retries: int,
+    stop: Callable[[], bool],
+) -> Iterator[Event]:
+    """What happens to the futures, until none is left in the mapping; each with the index of its task."""
+    from distributed.scheduler import KilledWorker
+
+    seen: set[int] = set()
+    while futures:
+        if stop():
+            waiting = [future for future, index in futures.items() if index not in seen]
+            client.cancel(waiting)
+            for future in waiting:
+                del futures[future]
+        time.sleep(0.05 if any(future.done() for future in futures) else _WAIT_S)
+        while messages:
+            index, value = messages.popleft()
+            if index not in seen:
+                seen.add(index)
+                yield Event(index, "started", None, 1, 0)
+            yield Event(index, "progress", value, 1, 0)
+        for future in [future for future in futures if future.done()]:
+            index = futures.pop(future)
+            if future.status == "finished":
+                yield Event(index, "finished", future.result(), 1, 0)
+                continue
+            error = future.exception() if future.status == "error" else None
+            is_dead = isinstance(error, KilledWorker)
+            why = "every worker that took it died" if is_dead else f"the cluster gave it up: {error!r}"
+            yield Event(index, "died", why, retries + 1, 0)
 
 
 def _on_worker(function: Callable[[Any, Report], Any], index: int, task: Any, threads: int) -> Any:
@@ -105,13 +123,8 @@ def _on_worker(function: Callable[[Any, Report], Any], index: int, task: Any, th
 
     torch.set_num_threads(threads)
     worker = get_worker()
-    last: dict[str, float] = {}
 
-    def report(stage: str, done: int, total: int) -> None:
-        now = time.monotonic()
-        if stage in last and done < total and now - last[stage] < _REPORT_EVERY_S:
-            return
-        last[stage] = now
-        worker.log_event(TOPIC, {"index": index, "value": (stage, done, total)})
+    def send(*progress: Any) -> None:
+        worker.log_event(TOPIC, {"index": index, "value": progress})
 
-    return function(task, report)
+    return function(task, Throttled(send, _REPORT_EVERY_S))

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from rmis_calib.config import CalibrationConfig, load_config, parse_config
 from rmis_calib.errors import FileError, InputError
 from rmis_calib.io.configs import load_yaml, read_bytes, yaml_value
-from rmis_calib.io.folders import DESCRIPTION
+from rmis_calib.io.folders import DESCRIPTION, natural_order
 from rmis_calib.io.readers import PICTURE_SUFFIXES, VIDEO_SUFFIXES
 
 Task = Literal["calibrate", "detect"]
@@ -132,21 +132,6 @@ def _apart(names: list[str], root_name: str) -> list[str]:
         (ITSELF if name == "." else f"{name}/{ITSELF}") if is_folder else given
         for name, given, is_folder in zip(names, own, nested, strict=True)
     ]
-
-
-def natural_order(name: str) -> list[tuple[int, int, str]]:
-    """Sort key in which `case_10` comes after `case_9`."""
-    parts: list[tuple[int, int, str]] = []
-    digits = ""
-    for character in f"{name}\0":
-        if character.isdecimal() and character.isascii():
-            digits += character
-            continue
-        if digits:
-            parts.append((0, int(digits), ""))
-            digits = ""
-        parts.append((1, 0, character))
-    return parts
 
 
 @dataclass(frozen=True)

@@ -7,20 +7,19 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
-from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from rmis_calib import __version__
 from rmis_calib.batches.setups import SetupComparison
-from rmis_calib.batches.summary import BatchSummary, end_of
+from rmis_calib.batches.summary import PAGE, BatchSummary, end_of
 from rmis_calib.batches.task import RECORD, JobRecord
 from rmis_calib.io.atomic import atomic_write
 from rmis_calib.io.outputs import check_file, is_report
 from rmis_calib.report.content import Pose, pose
 from rmis_calib.report.formatting import UNKNOWN, significant
+from rmis_calib.report.page import template
 from rmis_calib.report.plots import plot_repeatability
 
-PAGE = "index.html"
 _ENDS = {
     "failed": ("bad", "Failed", 0),
     "solver_failed": ("bad", "No solution", 1),
@@ -95,15 +94,8 @@ def write_index(folder: Path, summary: BatchSummary, title: str) -> None:
         OutputError: another file is there, or it cannot be written.
     """
     check_file(folder / PAGE, is_report, overwrite=True)
-    environment = Environment(
-        loader=ChoiceLoader([PackageLoader("rmis_calib.batches"), PackageLoader("rmis_calib.report")]),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     rows = sorted((_row(folder, record) for record in summary.records), key=lambda row: row.rank)
-    page = environment.get_template(PAGE).render(
+    page = template(PAGE, "rmis_calib.batches").render(
         title=title,
         version=__version__,
         tone="ok" if summary.trustworthy else "weak",
@@ -178,7 +170,6 @@ def _embedded(path: Path) -> str:
 def _setup(setup: SetupComparison) -> PageSetup:
     pooled = setup.pooled
     plot = None
-    agrees = bool(pooled is not None and not setup.changes and (pooled.agreement is None or pooled.agreement.holds))
     if pooled is not None and len(setup.results) > 1:
         sigma = np.sqrt(np.stack([np.diagonal(np.asarray(result.covariance)) for result in setup.results]))
         marks = tuple(change.index for change in setup.changes)
@@ -187,8 +178,10 @@ def _setup(setup: SetupComparison) -> PageSetup:
         name=setup.setup,
         count=len(setup.names),
         sentences=tuple(setup.sentences()),
-        tone="open" if pooled is None or len(setup.names) < 2 else ("ok" if agrees and not setup.outliers else "weak"),
-        pose=pose("camera_right_T_arm", pooled.camera_right_T_arm) if pooled is not None and agrees else None,
+        tone="open"
+        if pooled is None or len(setup.names) < 2
+        else ("ok" if setup.agrees and not setup.outliers else "weak"),
+        pose=pose("camera_right_T_arm", pooled.camera_right_T_arm) if pooled is not None and setup.agrees else None,
         sigma=""
         if pooled is None
         else f"{significant(pooled.rotation_sigma_deg, 2)} deg, {significant(pooled.translation_sigma_mm, 2)} mm",

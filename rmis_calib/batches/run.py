@@ -12,16 +12,17 @@ from pathlib import Path, PurePosixPath
 from rmis_calib import __version__
 from rmis_calib.batches import cluster
 from rmis_calib.batches.fingerprint import fingerprint, last_change_s, size_bytes
-from rmis_calib.batches.jobs import Job, LeftOut, Task, find_jobs, natural_order, with_device
+from rmis_calib.batches.jobs import Job, LeftOut, Task, find_jobs, with_device
 from rmis_calib.batches.lock import locked
 from rmis_calib.batches.settings import BatchSettings
 from rmis_calib.batches.setups import SetupComparison, compare
-from rmis_calib.batches.summary import BatchSummary, check_summary_files
+from rmis_calib.batches.summary import PAGE, BatchSummary, check_summary_files
 from rmis_calib.batches.task import JobRecord, Order, run_job, write_failure
 from rmis_calib.batches.workers import Event, Limits, cores, free_memory_bytes, run_tasks
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.errors import InputError, OutputError
 from rmis_calib.io.atomic import write_json
+from rmis_calib.io.folders import natural_order
 from rmis_calib.io.outputs import check_apart, check_file, is_json_of, remove_own
 from rmis_calib.pipeline.device import require_device
 from rmis_calib.results import CalibrationResult, finite_or_none
@@ -202,7 +203,7 @@ def _one_round(
     summary = BatchSummary(
         tuple(kept), _setups(out, kept), now.left_out, tuple(record.name for record in now.done), not_done
     )
-    if orders or not (out / "index.html").exists() or not settings.watch:
+    if orders or not (out / PAGE).exists() or not settings.watch:
         summary.write(out)
         from rmis_calib.batches.page import write_index
 
@@ -255,7 +256,7 @@ def _work(
                 times = f" in each of {event.attempt} attempts" if event.attempt > 1 else ""
                 record = write_failure(order, "crash", f"{event.value}{times}")
             if record is not None:
-                log.info("%s: %s (%.1f s)", order.job.name, _end_in_words(record), record.seconds)
+                log.info("%s: %s (%.1f s)", order.job.name, record.line, record.seconds)
                 ended = ended or (settings.fail_fast and not record.trustworthy)
             progress(tracker.update(event, record))
             if record is not None:
@@ -270,10 +271,6 @@ def _seen_from_here(order: Order, record: JobRecord) -> JobRecord:
         return record
     message = f"its output, written on {record.host}, is not seen from here: do all workers share the output folder?"
     return JobRecord.of_failure(order, "output", message)
-
-
-def _end_in_words(record: JobRecord) -> str:
-    return f"failed: {record.message}" if record.outcome == "failed" else record.message
 
 
 class _Tracker:

@@ -63,11 +63,21 @@ class SetupComparison:
     drifts: tuple[Drift, ...]
 
     @property
+    def answer(self) -> Pooled | None:
+        """The pooled transform, where there is one for all of them."""
+        return None if self.changes else self.pooled
+
+    @property
+    def agrees(self) -> bool:
+        """Whether there is one transform, and the results that count agree on it."""
+        return self.answer is not None and (self.answer.agreement is None or self.answer.agreement.holds)
+
+    @property
     def outliers(self) -> tuple[str, ...]:
         """Names of the recordings that do not fit the others."""
-        if self.pooled is None or self.changes:
+        if self.answer is None:
             return ()
-        return tuple(name for name, keep in zip(self.names, self.pooled.kept, strict=True) if not keep)
+        return tuple(name for name, keep in zip(self.names, self.answer.kept, strict=True) if not keep)
 
     def sentences(self) -> list[str]:
         """What there is to say, most important first."""

@@ -11,8 +11,9 @@ from rmis_calib.batches.jobs import LeftOut
 from rmis_calib.batches.setups import SetupComparison
 from rmis_calib.batches.task import JobRecord
 from rmis_calib.io.atomic import atomic_write, write_json
-from rmis_calib.io.outputs import check_file
+from rmis_calib.io.outputs import check_file, is_json_of, is_report
 
+PAGE = "index.html"
 SUMMARY_FORMAT = "rmis-calib-batch-summary/1"
 TIMES = ("seconds", "host", "written")
 """Keys in which two runs of the same work differ."""
@@ -116,22 +117,17 @@ def flat_row(record: JobRecord) -> dict[str, Any]:
 
 def setup_record(setup: SetupComparison) -> dict[str, Any]:
     """A comparison as plain values."""
-    pooled = setup.pooled
+    pooled, answer = setup.pooled, setup.answer
+    agreement = None if pooled is None else pooled.agreement
     return {
         "setup": setup.setup,
         "recordings": list(setup.names),
         "sentences": setup.sentences(),
-        "camera_right_T_arm": None if pooled is None or setup.changes else pooled.camera_right_T_arm.to_dict(),
-        "covariance": None if pooled is None or setup.changes else pooled.covariance.tolist(),
-        "rotation_sigma_deg": None if pooled is None or setup.changes else pooled.rotation_sigma_deg,
-        "translation_sigma_mm": None if pooled is None or setup.changes else pooled.translation_sigma_mm,
-        "agreement": None
-        if pooled is None or pooled.agreement is None
-        else {
-            "chi2": pooled.agreement.chi2,
-            "degrees_of_freedom": pooled.agreement.degrees_of_freedom,
-            "probability": pooled.agreement.probability,
-        },
+        "camera_right_T_arm": None if answer is None else answer.camera_right_T_arm.to_dict(),
+        "covariance": None if answer is None else answer.covariance.tolist(),
+        "rotation_sigma_deg": None if answer is None else answer.rotation_sigma_deg,
+        "translation_sigma_mm": None if answer is None else answer.translation_sigma_mm,
+        "agreement": None if agreement is None else vars(agreement),
         "outliers": list(setup.outliers),
         "deviation_rad_mm": None if pooled is None else pooled.deviation.tolist(),
         "changes": [
@@ -172,9 +168,6 @@ def check_summary_files(folder: Path) -> None:
     Raises:
         OutputError: a file of that name is none of ours.
     """
-    from rmis_calib.batches.page import PAGE
-    from rmis_calib.io.outputs import is_json_of, is_report
-
     tests = {"summary.json": is_json_of(SUMMARY_FORMAT), PAGE: is_report}
     for name, is_ours in tests.items():
         check_file(folder / name, is_ours, overwrite=True)

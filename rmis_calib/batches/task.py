@@ -8,7 +8,6 @@ import contextlib
 import cProfile
 import io
 import json
-import math
 import os
 import pstats
 import shutil
@@ -25,6 +24,7 @@ from rmis_calib.batches.jobs import Job
 from rmis_calib.errors import OutputError, RmisCalibError
 from rmis_calib.io.atomic import atomic_directory, write_json
 from rmis_calib.io.configs import load_json
+from rmis_calib.results import finite_or_none
 
 if TYPE_CHECKING:
     from rmis_calib.io import RecordingDescription
@@ -72,7 +72,7 @@ class JobRecord:
         outcome: `finished` with a result, whatever its verdict, or `failed`.
         failure: kind of failure; None for a finished one.
         message: the result's line, or why there is none.
-        row: what the summary shows of the result (`row_of_result`, `row_of_lines`).
+        row: what the summary shows of the result (`row_of_run`).
         stages: seconds of each stage.
         seconds: of everything.
         host: machine that did it.
@@ -102,13 +102,18 @@ class JobRecord:
         """A result that passed its own checks; of `detect`, lines in a file."""
         return self.outcome == "finished" and (self.task == "detect" or self.row.get("status") == "ok")
 
+    @property
+    def line(self) -> str:
+        """How it ended, for people."""
+        return f"failed: {self.message}" if self.outcome == "failed" else self.message
+
     def write(self, folder: Path) -> None:
         """Write `job.json`.
 
         Raises:
             OutputError: it cannot be written.
         """
-        write_json(folder / RECORD, {"format": JOB_FORMAT, **_finite(asdict(self))})
+        write_json(folder / RECORD, {"format": JOB_FORMAT, **finite_or_none(asdict(self))})
 
     @classmethod
     def read(cls, folder: Path) -> "JobRecord | None":
@@ -332,12 +337,3 @@ def _profiled(path: Path | None) -> Iterator[None]:
     text = io.StringIO()
     pstats.Stats(profile, stream=text).sort_stats("cumulative").print_stats(_PROFILED)
     path.write_text(text.getvalue(), encoding="utf-8")
-
-
-def _finite(value: Any) -> Any:
-    """The value with numbers that are not finite as None."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

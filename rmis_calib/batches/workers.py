@@ -236,23 +236,24 @@ def _work(connection: Connection, function: Callable[[Any, Report], Any], limits
         if given is None:
             return
         connection.send(("begun", None))
-        value = function(given[0], _Reporter(connection))
+        report = Throttled(lambda *progress: connection.send(("progress", progress)), _REPORT_EVERY_S)
+        value = function(given[0], report)
         connection.send(("finished", value))
 
 
-class _Reporter:
-    """Sends progress to the parent: the first and the last of a stage, and between them a few a second."""
+class Throttled:
+    """A report that passes on the first and the last of a stage, and between them one every few moments."""
 
-    def __init__(self, connection: Connection) -> None:
-        self._connection = connection
+    def __init__(self, send: Report, every_s: float) -> None:
+        self._send, self._every_s = send, every_s
         self._last: dict[str, float] = {}
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         now = time.monotonic()
-        if stage in self._last and done < total and now - self._last[stage] < _REPORT_EVERY_S:
+        if stage in self._last and done < total and now - self._last[stage] < self._every_s:
             return
         self._last[stage] = now
-        self._connection.send(("progress", (stage, done, total)))
+        self._send(stage, done, total)
 
 
 def _end_with_parent() -> None:

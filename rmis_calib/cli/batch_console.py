@@ -72,8 +72,7 @@ def _line_reporter() -> "Callable[[Progress], None]":
 def _end_line(progress: "Progress") -> str:
     record = progress.record
     assert record is not None
-    what = f"failed: {record.message}" if record.outcome == "failed" else record.message
-    return f"[{progress.done_jobs}/{progress.jobs}] {record.name} ({record.seconds:.1f} s): {what}"
+    return f"[{progress.done_jobs}/{progress.jobs}] {record.name} ({record.seconds:.1f} s): {record.line}"
 
 
 def _left(seconds: float | None) -> str:
@@ -129,7 +128,7 @@ def conclude_batch(summary: "BatchSummary", page: "Path") -> int:
     print_table("recordings", [(end.replace("_", " "), str(count)) for end, count in summary.counts.items()])
     for record in summary.records:
         if not record.trustworthy:
-            say(f"{record.name}: {'failed: ' if record.outcome == 'failed' else ''}{record.message}")
+            say(f"{record.name}: {record.line}")
     for name in summary.not_done:
         say(f"{name}: not begun")
     for setup in summary.setups:
@@ -157,7 +156,7 @@ def conclude_comparison(comparison: "SetupComparison", results: "dict[str, Calib
             predicted = f"predicted {sigma.rotation_sigma_deg:.2g} deg, {sigma.translation_sigma_mm:.2g} mm"
             rows.append((name, f"{turn:.3g} deg, {shift:.3g} mm away; {predicted}{'' if keep else '; does not fit'}"))
         print_table("from the pooled transform", rows)
-        if not comparison.changes:
+        if comparison.answer is not None:
             matrix = pooled.camera_right_T_arm.matrix.tolist()
             lines = ["".join(f"{x:10.6f}" for x in row[:3]) + f"{row[3]:12.4f}" for row in matrix[:3]]
             sigma = f"{pooled.rotation_sigma_deg:.3f} deg, {pooled.translation_sigma_mm:.3f} mm"
@@ -166,7 +165,5 @@ def conclude_comparison(comparison: "SetupComparison", results: "dict[str, Calib
             )
     for sentence in comparison.sentences():
         console.print(sentence, soft_wrap=True, markup=False)
-    pooled = comparison.pooled
-    agrees = pooled is not None and not comparison.changes and (pooled.agreement is None or pooled.agreement.holds)
-    all_fit = agrees and len(comparison.names) == len(results) and not comparison.outliers
+    all_fit = comparison.agrees and len(comparison.names) == len(results) and not comparison.outliers
     return EXIT_OK if all_fit else EXIT_NOT_TRUSTWORTHY

@@ -209,12 +209,18 @@ def _inverse_2x2(matrix: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 2
     return adjugate / det[..., None, None]
 
 
-def corrected_points(
-    xy: Float[Tensor, "*batch 2"], focal: float, centre_x: float, centre_y: float, lens: float
-) -> Float[Tensor, "*batch 2"]:
-    """Undistorted points of a camera as `Camera.corrected` would have them, to first order."""
-    scale = focal + lens * xy.square().sum(-1, keepdim=True)
-    return xy * (1.0 + scale) + xy.new_tensor([centre_x, centre_y])
+def corrected_point(
+    x: Tensor,
+    y: Tensor,
+    focal: Tensor | float,
+    centre_x: Tensor | float,
+    centre_y: Tensor | float,
+    lens: Tensor | float,
+) -> tuple[Tensor, Tensor]:
+    """Undistorted points (x, y) of a camera as `Camera.corrected` would have them, to first order; any shapes that
+    broadcast."""
+    scale = focal + (x * x + y * y) * lens
+    return x + (x * scale + centre_x), y + (y * scale + centre_y)
 
 
 @dataclass(frozen=True, eq=False)

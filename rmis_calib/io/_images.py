@@ -1,7 +1,6 @@
 """A folder of images as a source of frames. OpenCV decodes cut-off files without a word, so they are checked first."""
 
 import contextlib
-import re
 import struct
 import warnings
 import zlib
@@ -15,6 +14,7 @@ from PIL import Image
 from rmis_calib.errors import FileError, VideoError
 from rmis_calib.io._depth import bits_of, eight_bits
 from rmis_calib.io.configs import read_bytes
+from rmis_calib.io.folders import natural_order
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
 # Raw pixels are what the camera was calibrated on: no turning by what a file says about orientation.
@@ -132,17 +132,12 @@ def _list_images(folder: Path) -> list[Path]:
             raise VideoError(where=str(folder), expected="images only (jpg, png, bmp, tif)", found=path.name)
     if not files:
         raise VideoError(where=str(folder), expected="a folder of images", found="an empty one")
-    by_number = sorted(files, key=lambda path: [int(part) if part.isdigit() else part for part in _split(path.name)])
+    by_number = sorted(files, key=lambda path: natural_order(path.name))
     if by_number != files:
         first = next(i for i, (a, b) in enumerate(zip(files, by_number, strict=True)) if a != b)
         found = f"{files[first].name} before {by_number[first].name}: pad the numbers with zeros"
         raise VideoError(where=str(folder), expected="names that sort alike as text and by number", found=found)
     return files
-
-
-def _split(name: str) -> list[str]:
-    """Text and digit runs in turn, text first, so that two names compare part by part."""
-    return re.split(r"([0-9]+)", name)
 
 
 def _truncation(data: bytes) -> str:

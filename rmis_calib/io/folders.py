@@ -1,5 +1,6 @@
-"""Where a recording is. Imports nothing heavy, so that a wrong path is told at once."""
+"""Where a recording is, and the order of names. Imports nothing heavy, so that a wrong path is told at once."""
 
+import re
 from pathlib import Path
 
 from rmis_calib.errors import FileError
@@ -26,3 +27,10 @@ def recording_folder(path: str | Path) -> Path:
         hint = f" (did you mean {inside[0]}?)" if inside else ""
         raise FileError(where=str(path), expected=expected, found=f"a folder without it{hint}")
     return folder
+
+
+def natural_order(name: str) -> list[str | int]:
+    """Sort key in which `case_10` comes after `case_9`: text and numbers in turn, text first."""
+    parts: list[str | int] = [*re.split(r"([0-9]+)", name)]
+    parts[1::2] = map(int, parts[1::2])
+    return parts

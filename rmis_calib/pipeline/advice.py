@@ -26,6 +26,7 @@ from rmis_calib.pipeline.observations import problem_of
 from rmis_calib.pipeline.offset_unknowns import KinematicUnknowns, estimated_offsets
 from rmis_calib.pipeline.result import used_motions
 from rmis_calib.pipeline.run import CalibrationRun
+from rmis_calib.pipeline.words import joined
 from rmis_calib.robot import split_joint_column
 from rmis_calib.solver import Problem, Solution, SolveStatus
 from rmis_calib.solver.assess.next_motion import Advice, advise, measured_alike
@@ -379,8 +380,3 @@ def _laparoscope_moves(
             camera_right_T_moved.append(((words,), rigid_from_rotation_translation(eye, shift)))
     arm_T_camera_right = rigid_inverse(camera_right_T_arm)
     return [(words, arm_T_camera_right @ moved @ camera_right_T_arm) for words, moved in camera_right_T_moved]
-
-
-def joined(parts: list[str]) -> str:
-    """Parts of a sentence as a list in words."""
-    return parts[0] if len(parts) == 1 else ", ".join(parts[:-1]) + " and " + parts[-1]

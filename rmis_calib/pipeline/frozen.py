@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from rmis_calib.pipeline.poses import MotionPoses
+from rmis_calib.pipeline.words import ranges_in_words
 from rmis_calib.vision import FrameReason, ShaftDetections
 
 _STRIDE = 4
@@ -16,7 +17,6 @@ _SAME_LEVELS = 3
 """Largest change, of 255, in a picture that was copied and coded again; noise alone changes more."""
 _MOVED_RAD, _MOVED_MM = 0.005, 1.0
 """Motion of the shaft (0.3 deg, or of the RCM, or along itself) that no picture can fail to show."""
-_NAMED_RANGES = 4
 
 
 class ChangeMeter:
@@ -65,10 +65,7 @@ def without_frames(detections: ShaftDetections, frames: np.ndarray) -> ShaftDete
 
 def about_repeats(side: str, frames: np.ndarray) -> str:
     """A sentence that names the frames in ranges."""
-    breaks = np.flatnonzero(np.diff(frames) > 1)
-    starts, ends = frames[[0, *(breaks + 1)]], frames[[*breaks, -1]]
-    ranges = [f"{a} to {b}" if b > a else f"{a}" for a, b in zip(starts, ends, strict=True)]
-    named = ", ".join(ranges[:_NAMED_RANGES]) + (", ..." if len(ranges) > _NAMED_RANGES else "")
+    named = ranges_in_words(frames.tolist())
     return (
         f"camera_{side}: {len(frames)} pictures repeat the one before although the joints moved (frames {named}); "
         "they were left out: does the grabber hang, or were frames written twice?"

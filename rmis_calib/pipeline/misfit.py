@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rmis_calib.config import CalibrationConfig
-from rmis_calib.geometry.cameras import Camera, corrected_points
+from rmis_calib.geometry.cameras import Camera, corrected_point
 from rmis_calib.pipeline.association import Choice
 from rmis_calib.pipeline.observations import ANOTHER_INSTRUMENT
 from rmis_calib.pipeline.offset_unknowns import KinematicUnknowns, poses_at_motions
@@ -52,9 +52,10 @@ def with_misfit_named(
         return run
     if SolveStatus(int(solution.status)) in _TELLING and not is_misfit(result):
         return run
-    kept, run = run, plainly()
-    if run.solution is None or run.result.camera_right_T_arm is None:
-        run = kept
+    kept = run
+    if any(any(result.intrinsic_correction(view.side)) for view in run.views):
+        plain = plainly()
+        run = kept if plain.solution is None or plain.result.camera_right_T_arm is None else plain
     unknowns = KinematicUnknowns(run.recording, run.poses.frames, config.device)
     found = [view.at(run.poses.frames) for view in run.views]
     moved = None
@@ -182,7 +183,8 @@ def signed_residuals(
     """
     rows = torch.arange(len(choice.candidate), device=choice.candidate.device)
     middle = found.axis_xy[rows, choice.candidate.clamp_min(0)].double().mean(1)  # (m, 2)
-    middle = corrected_points(middle, *off)
+    x, y = middle.unbind(-1)
+    middle = torch.stack(corrected_point(x, y, *off), dim=-1)
     focal = float(camera.focal)
     now = _distance(predicted, middle)
     velocity = torch.full_like(now, torch.nan)

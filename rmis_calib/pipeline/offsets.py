@@ -58,13 +58,7 @@ def estimate_with_kinematics(
     if asked.joint_offsets == "never":
         sigma = sigma * 0.0
     if clock_s is None:
-        clock_s = unknowns.clock_at_s
-    if clock_s is None:
-        clock_s = 0.0
-        if asked.clock and unknowns.has_clock:
-            # Whatever is measured: the axis lines tell the clock even where the answer does not use them.
-            lines = Problem.from_observations(observations, device=config.device).only("axis").flatten_batch()
-            clock_s = _clock_start(lines, unknowns, config.clock_search_s, sigma)
+        clock_s = _clock_start(observations, config, unknowns, sigma)
     clock_at = sigma.new_full((1,), clock_s)
 
     def solve_with(
@@ -138,15 +132,24 @@ def _shown(sigma: float, column: str) -> str:
     return f"{np.rad2deg(sigma):.2g} deg" if split_joint_column(column)[1] == "rad" else f"{sigma:.2g} mm"
 
 
-def _clock_start(base: Problem, unknowns: OffsetUnknowns, reach_s: float, like: torch.Tensor) -> float:
-    """Clock offset at which axis lines and joints agree best; 0 unless another one is clearly better."""
+def _clock_start(
+    observations: ShaftObservations, config: CalibrationConfig, unknowns: OffsetUnknowns, like: Float[Tensor, " j"]
+) -> float:
+    """Clock offset to start from: that of the unknowns; else the one at which axis lines and joints agree best, where
+    it is clearly better than 0."""
+    if unknowns.clock_at_s is not None:
+        return unknowns.clock_at_s
+    if not (config.solver.unknowns.clock and unknowns.has_clock):
+        return 0.0
+    # Whatever is measured: the axis lines tell the clock even where the answer does not use them.
+    base = Problem.from_observations(observations, device=config.device).only("axis").flatten_batch()
 
     def scan(centre_s: float, half_s: float, step_s: float) -> tuple[float, torch.Tensor]:
         count = 2 * round(half_s / step_s) + 1
         offsets = centre_s + torch.linspace(-half_s, half_s, count).to(like)
         return scan_clock(lambda joint, clock: unknowns.at(base, joint, clock), len(like), offsets)
 
-    coarse_s, coarse = scan(0.0, reach_s, COARSE_CLOCK_STEP_S)
+    coarse_s, coarse = scan(0.0, config.clock_search_s, COARSE_CLOCK_STEP_S)
     best_s, fine = scan(coarse_s, COARSE_CLOCK_STEP_S, CLOCK_STEP_S)
     better = min(float(coarse.min()), float(fine.min())) < CLEARLY_BETTER * float(coarse[len(coarse) // 2])
     return best_s if better else 0.0

@@ -14,6 +14,7 @@ from rmis_calib.pipeline.association import (
 from rmis_calib.pipeline.detection import View
 from rmis_calib.pipeline.observations import reasons_for
 from rmis_calib.pipeline.poses import MotionPoses
+from rmis_calib.pipeline.words import ranges_in_words
 from rmis_calib.results import (
     INTRINSICS,
     JOINT_OFFSET,
@@ -264,18 +265,6 @@ def about_cameras(solution: Solution) -> tuple[str, ...]:
     if not said:
         return ()
     return (f"The pictures ask for other cameras: {'; '.join(said)}. The transform belongs to the corrected ones.",)
-
-
-def ranges_in_words(numbers: list[int], most: int = 4) -> str:
-    """Increasing numbers as ranges: `3, 7 to 12`; the rest of many ranges is left out."""
-    ranges: list[tuple[int, int]] = []
-    for number in numbers:
-        if ranges and number == ranges[-1][1] + 1:
-            ranges[-1] = (ranges[-1][0], number)
-        else:
-            ranges.append((number, number))
-    words = [f"{a}" if a == b else f"{a} to {b}" for a, b in ranges]
-    return ", ".join(words[:most]) + (", ..." if len(words) > most else "")
 
 
 def _contradiction(groups: GroupCheck) -> str:

@@ -39,12 +39,13 @@ def write_overlay_videos(folder: Path, run: CalibrationRun) -> None:
     if not len(run.poses.frames):
         return
     times_s = run.recording.frame_times_s[run.poses.frames]
-    for side in (view.side for view in run.views):
-        source = next(view.source for view in run.views if view.side == side)
-        height, width = source.size
+    for view in run.views:
+        height, width = view.source.size
         strip = _strip_height(height)
-        with OverlayVideo(folder / f"overlay_{side}.mp4", (height + strip, width), playing_rate_hz(times_s)) as video:
-            for overlay in overlays(run, np.arange(len(run.poses.frames)), side):
+        with OverlayVideo(
+            folder / f"overlay_{view.side}.mp4", (height + strip, width), playing_rate_hz(times_s)
+        ) as video:
+            for overlay in overlays(run, np.arange(len(run.poses.frames)), view.side):
                 video.add(np.concatenate([overlay.image, _strip(overlay, run.result, strip)]))
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rmis_calib.solver.model.normal_equations import NoiseModel
 from rmis_calib.solver.model.parameters import ParameterLayout
-from rmis_calib.solver.model.residuals import State
+from rmis_calib.solver.model.state import State
 from rmis_calib.solver.observability import ObservabilityTensors
 from rmis_calib.solver.status import SolveStatus
 
@@ -91,6 +91,24 @@ class GroupCheck:
     change: Float[Tensor, "b 6"]
     change_sigmas: Float[Tensor, " b"]
     change_at: Int[Tensor, " b"]
+
+    @classmethod
+    def none(cls, used: Bool[Tensor, "b n"], like: Float[Tensor, "b 3"]) -> "GroupCheck":
+        """Where motions are too few for groups."""
+        b, zero = len(like), torch.zeros_like(like[:, 0])
+        return cls(
+            group=torch.full_like(used, -1, dtype=torch.int64),
+            count=0,
+            shift=like.new_zeros(b, 0, 6),
+            sigmas=like.new_zeros(b, 0),
+            growth=torch.eye(6, dtype=like.dtype, device=like.device).expand(b, 6, 6),
+            inflation=torch.ones_like(zero),
+            halves=like.new_zeros(b, 6),
+            halves_sigmas=zero,
+            change=like.new_zeros(b, 6),
+            change_sigmas=zero,
+            change_at=torch.zeros_like(zero, dtype=torch.int64),
+        )
 
     @property
     def contradicts(self) -> Bool[Tensor, " b"]:

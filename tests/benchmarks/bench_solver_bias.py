@@ -30,7 +30,8 @@ from rmis_calib.solver.model.batched_linalg import batch_last, dot, rotate, rota
 from rmis_calib.solver.model.measurement_rows import MeasurementRows
 from rmis_calib.solver.model.normal_equations import NoiseModel, covariance, image_variance
 from rmis_calib.solver.model.parameters import ParameterLayout, columns
-from rmis_calib.solver.model.residuals import State, linearise
+from rmis_calib.solver.model.residuals import linearise
+from rmis_calib.solver.model.state import State
 from tests.benchmarks.solver_common import (
     KNOWN_RADIUS,
     REALISTIC,

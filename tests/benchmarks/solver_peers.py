@@ -26,7 +26,8 @@ from rmis_calib.solver.estimate.noise_levels import assumed_noise
 from rmis_calib.solver.model.measurement_rows import pack
 from rmis_calib.solver.model.normal_equations import covariance, image_variance
 from rmis_calib.solver.model.parameters import NuisancePriors, columns, initial_state, make_layout
-from rmis_calib.solver.model.residuals import State, linearise, residual_rows
+from rmis_calib.solver.model.residuals import linearise, residual_rows
+from rmis_calib.solver.model.state import State
 
 Rows = Callable[[np.ndarray, np.ndarray], np.ndarray]
 

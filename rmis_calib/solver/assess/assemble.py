@@ -18,7 +18,8 @@ from rmis_calib.solver.estimate.outliers import REJECTED
 from rmis_calib.solver.model.measurement_rows import END, HEAD, LINE, MeasurementRows, pack
 from rmis_calib.solver.model.normal_equations import NoiseModel, motion_distance2
 from rmis_calib.solver.model.parameters import TRANSLATION_SIGMA_MM, UNITS, NuisancePriors, initial_state
-from rmis_calib.solver.model.residuals import State, residual_rows
+from rmis_calib.solver.model.residuals import residual_rows
+from rmis_calib.solver.model.state import State
 from rmis_calib.solver.observability import Degeneracy, ObservabilityTensors
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import SolverSettings
@@ -180,8 +181,7 @@ def _posterior(fit: MapEstimate, excess: Float[Tensor, " b"]) -> Posterior:
 def _judge(fit: MapEstimate) -> tuple[Int[Tensor, " b"], Int[Tensor, "b n"], Float[Tensor, " b"]]:
     """Status, what became of each motion, and chi^2 per degree of freedom."""
     rows, used = fit.model.measured, fit.weight > REJECTED
-    cameras = torch.tensor(rows.row_camera, device=used.device)
-    measured = torch.stack([rows.rows_ok[cameras == c].any(0) for c in range(rows.cameras)])
+    measured = rows.rows_seen > 0
     good = (used & measured).any(0)
     reason = torch.where(good, MotionReason.USED, MotionReason.OUTLIER)
     reason = torch.where(good & (measured & ~used).any(0), MotionReason.OUTLIER_ONE_CAMERA, reason)

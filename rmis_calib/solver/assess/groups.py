@@ -22,7 +22,8 @@ from rmis_calib.solver.estimate.map_estimate import MapEstimate
 from rmis_calib.solver.estimate.outliers import REJECTED
 from rmis_calib.solver.model.batched_linalg import unit_diagonal
 from rmis_calib.solver.model.measurement_rows import MeasurementRows
-from rmis_calib.solver.model.normal_equations import group_sums
+from rmis_calib.solver.model.normal_equations import WeightedModel, group_sums, membership
+from rmis_calib.solver.model.state import State
 from rmis_calib.solver.solution import GroupCheck
 
 LEAST_GROUPS = 5
@@ -34,8 +35,6 @@ LEAST_USED = 3
 LEVER_MM = 100.0
 """Length that turns a change of the shaft's direction into a displacement: from the trocar to the working point."""
 LLOYD_ROUNDS = 12
-CLEAR = 0.99
-"""Quantile of chance beyond which a single direction, or a single group, is said to disagree."""
 TINY = 1e-20
 """Variance, rad^2 or mm^2, below which a direction is none: the inverse has left it out."""
 HARDLY_SEEN = 40.0
@@ -54,58 +53,37 @@ def check_groups(fit: MapEstimate, asked: int) -> GroupCheck:
         asked: groups wanted; fewer where motions are few.
     """
     measured, state = fit.model.measured, fit.state
-    used = ((fit.weight > REJECTED) & _measured(measured)).any(0)  # (b, n)
+    used = ((fit.weight > REJECTED) & (measured.rows_seen > 0)).any(0)  # (b, n)
     count = min(asked, measured.motions // MOTIONS_A_GROUP)
-    enough = used.sum(-1) >= LEAST_USED * count
-    b, like = state.t.shape[0], state.t
-    eye = torch.eye(6, dtype=like.dtype, device=like.device).expand(b, 6, 6)
     if count < LEAST_GROUPS:
-        none = torch.full_like(used, -1, dtype=torch.int64)
-        return GroupCheck(
-            group=none,
-            count=0,
-            shift=like.new_zeros(b, 0, 6),
-            sigmas=like.new_zeros(b, 0),
-            growth=eye,
-            halves=like.new_zeros(b, 6),
-            halves_sigmas=like.new_zeros(b),
-            change=like.new_zeros(b, 6),
-            change_sigmas=like.new_zeros(b),
-            change_at=torch.zeros_like(none[:, 0]),
-            inflation=torch.ones_like(like[:, 0]),
-        )
-    group = neighbours(where_motions_are(measured), used, count)
-    H_k, s_k = map(torch.nan_to_num, group_sums(fit.model, state, group, count))  # (b, k, p, p), (b, k, p)
+        return GroupCheck.none(used, state.t)
+    place = where_motions_are(measured)
+    group = neighbours(place, used, count)
+    H_k, s_k = _sums(fit.model, state, group, count)
     prior = fit.model.layout.sigma.square().reciprocal()
-    H = H_k.sum(1) + torch.diag_embed(prior)
     deviation, _ = fit.model.layout.prior(state)
     s_k = s_k - (s_k.sum(1) + prior * deviation)[:, None] / count  # what the bias correction left of the score
-    shift, covariance_k, covariance = _left_out(H, H_k, s_k)
+    H = H_k.sum(1) + torch.diag_embed(prior)
+    rest = inverse(H[:, None] - H_k)
+    shift = (rest @ s_k[..., None])[..., :6, 0]
+    covariance, covariance_k = inverse(H)[..., :6, :6], rest[..., :6, :6]
     told = torch.isfinite(shift).flatten(1).all(-1) & (covariance.diagonal(dim1=-2, dim2=-1) > TINY).all(-1)
-    enough = enough & told
+    enough = told & (used.sum(-1) >= LEAST_USED * count)
+    eye = torch.eye(6, dtype=shift.dtype, device=shift.device)
     covariance = torch.where(told[:, None, None], covariance, eye)
-    covariance_k = torch.where(told[:, None, None, None], covariance_k, eye[:, None])
+    covariance_k = torch.where(told[:, None, None, None], covariance_k, eye)
     shift = torch.where(told[:, None, None], shift, 0.0)
     root, inverse_root = _roots(covariance)
     own = shift @ inverse_root.mT  # (b, k, 6)
     extra = inverse_root[:, None] @ (covariance_k - covariance[:, None]) @ inverse_root[:, None].mT
-    expected = _bounded(extra.sum(1)) + _RIDGE * eye
-    found = _bounded(own.mT @ own) + _RIDGE * eye
-    E_values, E_vectors = torch.linalg.eigh(expected)
-    narrow = E_vectors * E_values.clamp_min(_RIDGE).rsqrt()[:, None] @ E_vectors.mT
-    W = narrow @ found @ narrow
-    values, vectors = torch.linalg.eigh(_bounded(0.5 * (W + W.mT)))
-    # The mean of all directions is known to a fifth with eight groups; a single direction counts only where it is
-    # beyond what the largest of six directions reaches by chance.
-    mean = values.mean(-1, keepdim=True).clamp_min(1.0)
-    factor = torch.where(values > _largest_by_chance(count), values, 0.0).maximum(mean)
+    factor, turn = _growth(own, extra)
     factor = torch.where(enough[:, None], factor, 1.0)
-    growth = root @ (vectors * factor.sqrt()[:, None] @ vectors.mT) @ inverse_root
-    first_half = _first_half(where_motions_are(measured), group, count)
+    growth = root @ (turn * factor.sqrt()[:, None] @ turn.mT) @ inverse_root
+    first_half = _first_half(place, group, count)
     halves, apart = _difference(H_k, s_k, prior, deviation, first_half[:, None], growth, inverse_root)
     changes, change_apart = _changes_in_time(fit, growth, inverse_root, count)
     clearest = change_apart.argmax(-1)
-    sigmas = torch.linalg.solve(extra + _RIDGE * eye[:, None], own[..., None])[..., 0]
+    sigmas = torch.linalg.solve(extra + _RIDGE * eye, own[..., None])[..., 0]
     return GroupCheck(
         group=torch.where(enough[:, None], group, -1),
         count=count,
@@ -116,9 +94,38 @@ def check_groups(fit: MapEstimate, asked: int) -> GroupCheck:
         halves_sigmas=torch.where(enough, apart[:, 0], 0.0),
         change=torch.take_along_dim(changes, clearest[:, None, None], dim=1)[:, 0],
         change_sigmas=torch.where(enough, change_apart.amax(-1), 0.0),
-        change_at=_first_of_block(measured.motions, count, like)[clearest + 1],
+        change_at=_first_of_block(measured.motions, count, clearest + 1),
         inflation=factor.mean(-1).sqrt(),
     )
+
+
+def _growth(
+    own: Float[Tensor, "b k 6"], extra: Float[Tensor, "b k 6 6"]
+) -> tuple[Float[Tensor, "b 6"], Float[Tensor, "b 6 6"]]:
+    """Factors on the variance, 1 or more, along orthogonal directions (columns).
+
+    The mean of all directions is known to a fifth with eight groups; a single direction counts only where it is beyond
+    what the largest of six directions reaches by chance.
+
+    Args:
+        own: shifts when a group is left out, in units of the covariance.
+        extra: covariance of each that noise alone would make, in the same units.
+    """
+    ridge = _RIDGE * torch.eye(6, dtype=own.dtype, device=own.device)
+    expected, axes = torch.linalg.eigh(_bounded(extra.sum(1)) + ridge)
+    narrow = axes * expected.clamp_min(_RIDGE).rsqrt()[:, None] @ axes.mT
+    W = narrow @ (_bounded(own.mT @ own) + ridge) @ narrow
+    values, vectors = torch.linalg.eigh(_bounded(0.5 * (W + W.mT)))
+    mean = values.mean(-1, keepdim=True).clamp_min(1.0)
+    return torch.where(values > _largest_by_chance(own.shape[1]), values, 0.0).maximum(mean), vectors
+
+
+def _sums(
+    model: WeightedModel, state: State, group: Int[Tensor, "b n"], count: int
+) -> tuple[Float[Tensor, "b k p p"], Float[Tensor, "b k p"]]:
+    """Information and score of each group, without what is not finite."""
+    H_k, s_k = group_sums(model, state, group, count)
+    return torch.nan_to_num(H_k), torch.nan_to_num(s_k)
 
 
 def where_motions_are(measured: MeasurementRows) -> Float[Tensor, "b n 9"]:
@@ -154,13 +161,12 @@ def neighbours(place: Float[Tensor, "b n d"], used: Tensor, count: int) -> Int[T
 
 def _first_half(place: Float[Tensor, "b n d"], group: Int[Tensor, "b n"], count: int) -> Float[Tensor, "b k"]:
     """1 for the groups that make up one half of the used motions, on one side along where they spread most."""
-    member = torch.nn.functional.one_hot(group + 1, count + 1)[..., 1:].to(place.dtype)
+    member = membership(group, count, place.dtype)
     sizes = member.sum(1)
     centre = member.mT @ place / sizes.clamp_min(1.0)[..., None]
     total = sizes.sum(-1).clamp_min(1.0)
-    centred = (centre - (sizes[..., None] * centre).sum(1, keepdim=True) / total[:, None, None]) * (sizes > 0)[
-        ..., None
-    ]
+    mean = (sizes[..., None] * centre).sum(1, keepdim=True) / total[:, None, None]
+    centred = torch.where(sizes[..., None] > 0, centre - mean, 0.0)
     _, vectors = torch.linalg.eigh(centred.mT @ (sizes[..., None] * centred))
     order = (centred @ vectors[..., -1:])[..., 0].argsort(-1)
     ordered = torch.take_along_dim(sizes, order, dim=-1)
@@ -179,22 +185,21 @@ def _changes_in_time(
     measured, weight, b = fit.model.measured, fit.weight, fit.state.t.shape[0]
     block = torch.arange(measured.motions, device=weight.device) * count // measured.motions
     member = torch.nn.functional.one_hot(block, count).to(weight.dtype)
-    counted = _measured(measured)
+    counted = measured.rows_seen > 0
     share = (
         ((weight < REJECTED) & counted).to(weight.dtype) @ member / (counted.to(weight.dtype) @ member).clamp_min(1.0)
     )
     mostly = (share > 0.5).any(0).to(weight.dtype) @ member.T > 0.5  # (b, n)
     model = fit.model if fit.model.weight is None else replace(fit.model, weight=torch.where(mostly, 1.0, weight))
-    H_k, s_k = map(torch.nan_to_num, group_sums(model, fit.state, block.expand(b, -1), count))
+    H_k, s_k = _sums(model, fit.state, block.expand(b, -1), count)
     prior = fit.model.layout.sigma.square().reciprocal()
     deviation, _ = fit.model.layout.prior(fit.state)
     before = torch.tril(torch.ones(count - 1, count, dtype=weight.dtype, device=weight.device))
     return _difference(H_k, s_k, prior, deviation, before.expand(b, -1, -1), growth, inverse_root)
 
 
-def _first_of_block(motions: int, count: int, like: Tensor) -> Int[Tensor, " k"]:
-    """Number of the first motion of each of `count` consecutive blocks."""
-    block = torch.arange(count, device=like.device)
+def _first_of_block(motions: int, count: int, block: Int[Tensor, " b"]) -> Int[Tensor, " b"]:
+    """Number of the first motion of one of `count` consecutive blocks."""
     return (block * motions + count - 1) // count
 
 
@@ -230,23 +235,9 @@ def _difference(
     return gap, torch.where(values < HARDLY_SEEN, along, 0.0).sum(-1).sqrt()
 
 
-def _measured(measured: MeasurementRows) -> Tensor:
-    cameras = torch.tensor(measured.row_camera, device=measured.rows_ok.device)
-    return torch.stack([measured.rows_ok[cameras == c].any(0) for c in range(measured.cameras)])
-
-
 def _bounded(matrix: Tensor) -> Tensor:
     """The matrix without what eigenvalue routines choke on; where it matters the answer is none anyway."""
     return torch.nan_to_num(matrix, nan=0.0, posinf=LARGEST, neginf=-LARGEST).clamp(-LARGEST, LARGEST)
-
-
-def _left_out(
-    H: Float[Tensor, "b p p"], H_k: Float[Tensor, "b k p p"], s_k: Float[Tensor, "b k p"]
-) -> tuple[Float[Tensor, "b k 6"], Float[Tensor, "b k 6 6"], Float[Tensor, "b 6 6"]]:
-    """Of the transform: its shift without each group, its covariance then, and that of all."""
-    rest = inverse(H[:, None] - H_k)
-    shift = (rest @ s_k[..., None])[..., :6, 0]
-    return shift, rest[..., :6, :6], inverse(H)[..., :6, :6]
 
 
 def _roots(matrix: Float[Tensor, "*b 6 6"]) -> tuple[Float[Tensor, "*b 6 6"], Float[Tensor, "*b 6 6"]]:
@@ -254,10 +245,8 @@ def _roots(matrix: Float[Tensor, "*b 6 6"]) -> tuple[Float[Tensor, "*b 6 6"], Fl
     scaled, scale = unit_diagonal(matrix)
     values, vectors = torch.linalg.eigh(scaled)
     values = values.clamp_min(1e-12).sqrt()
-    back = scale.reciprocal()
-    return back[..., :, None] * vectors * values[..., None, :], (vectors / values[..., None, :]).mT * scale[
-        ..., None, :
-    ]
+    root = vectors * values[..., None, :] / scale[..., :, None]
+    return root, (vectors / values[..., None, :]).mT * scale[..., None, :]
 
 
 def _largest_by_chance(count: int) -> float:

@@ -7,7 +7,8 @@ from torch import Tensor
 from rmis_calib.solver.model.batched_linalg import eliminate, rescaled, unit_diagonal
 from rmis_calib.solver.model.normal_equations import WeightedModel, covariance, image_variance
 from rmis_calib.solver.model.parameters import columns
-from rmis_calib.solver.model.residuals import State, linearise
+from rmis_calib.solver.model.residuals import linearise
+from rmis_calib.solver.model.state import State
 
 THINNING_ROUNDS = 16
 """Motions are picked in this many rounds, the information updated between; one by one keeps under 1 per cent more."""

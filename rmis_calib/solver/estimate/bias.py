@@ -28,13 +28,13 @@ from rmis_calib.solver.model.measurement_rows import LINE, MeasurementRows
 from rmis_calib.solver.model.normal_equations import NoiseModel, WeightedModel, image_variance, normal_equations
 from rmis_calib.solver.model.residuals import (
     Shaft,
-    State,
     _line_geometry,
     corrected_points,
     own_rows,
     predict_shaft,
     shaft_poses,
 )
+from rmis_calib.solver.model.state import State
 
 SIMULATED_PART = 16
 """One motion in so many is simulated in long recordings: the expected score is then known to about a fifth of its

@@ -21,7 +21,8 @@ from rmis_calib.solver.model.normal_equations import (
     with_prior,
 )
 from rmis_calib.solver.model.parameters import ParameterLayout
-from rmis_calib.solver.model.residuals import State, residual_rows
+from rmis_calib.solver.model.residuals import residual_rows
+from rmis_calib.solver.model.state import State
 from rmis_calib.solver.status import SolveStatus
 
 INITIAL_DAMPING = 1e-4

@@ -18,7 +18,7 @@ from rmis_calib.solver.model.batched_linalg import rescaled, unit_diagonal
 from rmis_calib.solver.model.measurement_rows import MeasurementRows, pack
 from rmis_calib.solver.model.normal_equations import NoiseModel, Normal, WeightedModel, with_prior
 from rmis_calib.solver.model.parameters import NuisancePriors, initial_state, make_layout
-from rmis_calib.solver.model.residuals import State
+from rmis_calib.solver.model.state import State
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import SolverSettings
 

@@ -23,7 +23,8 @@ from rmis_calib.solver.model.batched_linalg import rescaled, unit_diagonal
 from rmis_calib.solver.model.measurement_rows import END, HEAD, LINE, MeasurementRows
 from rmis_calib.solver.model.normal_equations import NoiseModel, WeightedModel, covariance, image_variance
 from rmis_calib.solver.model.parameters import ParameterLayout, columns
-from rmis_calib.solver.model.residuals import LinearisedRows, State, linearise
+from rmis_calib.solver.model.residuals import LinearisedRows, linearise
+from rmis_calib.solver.model.state import State
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import NoiseSettings
 

@@ -19,7 +19,7 @@ from rmis_calib.solver.model.implicit import newton_on_graph
 from rmis_calib.solver.model.measurement_rows import pack
 from rmis_calib.solver.model.normal_equations import NoiseModel, WeightedModel, accumulate
 from rmis_calib.solver.model.parameters import NuisancePriors, initial_state, make_layout
-from rmis_calib.solver.model.residuals import State
+from rmis_calib.solver.model.state import State
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import SolverSettings
 

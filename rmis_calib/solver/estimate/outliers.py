@@ -21,9 +21,8 @@ from scipy.special import chdtri
 from torch import Tensor
 
 from rmis_calib.solver.estimate.gauss_newton import solve_system
-from rmis_calib.solver.model.measurement_rows import MeasurementRows
 from rmis_calib.solver.model.normal_equations import WeightedModel, camera_distance2, normal_equations, with_prior
-from rmis_calib.solver.model.residuals import State
+from rmis_calib.solver.model.state import State
 
 MIN_WEIGHT = 1e-6
 REJECTED = 0.5
@@ -99,7 +98,7 @@ def classify(
     """
     measured, noise = model.measured, model.noise
     if distance2 is not None:
-        rows = torch.stack([measured.rows_ok[_rows_of(measured, c)].sum(0) for c in range(measured.cameras)])
+        rows = measured.rows_seen
         limit = chi2_quantile(rows.to(distance2.dtype), probability)
         limit = torch.where(rows > 0, limit, torch.inf).amin(0)
         trial, motion = torch.nonzero(~(distance2 <= limit) & (rows.sum(0) > 0), as_tuple=True)
@@ -118,7 +117,3 @@ def classify(
         ]
         weights.append(torch.cat(parts, dim=2))
     return torch.cat(weights, dim=1)
-
-
-def _rows_of(measured: MeasurementRows, camera: int) -> list[int]:
-    return [i for i, c in enumerate(measured.row_camera) if c == camera]

@@ -12,7 +12,7 @@ from functools import cached_property
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from rmis_calib.errors import ShapeError
@@ -143,12 +143,6 @@ class MeasurementRows:
     def own_components(self) -> int:
         return sum(len(rows.ok) for rows in self.own)
 
-    @property
-    def row_camera(self) -> tuple[int, ...]:
-        """Camera of each row."""
-        cameras = tuple(range(self.cameras))
-        return cameras * (self.line_xy.shape[1] + self.has_ends + 2 * self.has_heads + self.own_components)
-
     @cached_property
     def row_kind(self) -> tuple[int, ...]:
         """LINE, END, HEAD or OWN of each row."""
@@ -161,6 +155,11 @@ class MeasurementRows:
         heads = self.head_ok.repeat(2, 1, 1) if self.has_heads else self.head_ok
         own = [rows.among(self.cameras, rows.ok) for rows in self.own]
         return torch.cat((self.line_ok.flatten(0, 1), self.end_ok, heads, *own))
+
+    @cached_property
+    def rows_seen(self) -> Int[Tensor, "c b n"]:
+        """How many rows each camera has of a motion; rows take turns between the cameras."""
+        return self.rows_ok.unflatten(0, (-1, self.cameras)).sum(0)
 
     @cached_property
     def rows_var(self) -> Float[Tensor, "k b n"]:

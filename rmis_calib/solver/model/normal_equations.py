@@ -19,7 +19,8 @@ from rmis_calib.errors import InputError
 from rmis_calib.solver.model.batched_linalg import eliminate, forward_substitute
 from rmis_calib.solver.model.measurement_rows import END, HEAD, LINE, OWN, MeasurementRows
 from rmis_calib.solver.model.parameters import ParameterLayout, columns
-from rmis_calib.solver.model.residuals import LinearisedRows, Shaft, State, linearise
+from rmis_calib.solver.model.residuals import LinearisedRows, Shaft, linearise
+from rmis_calib.solver.model.state import State
 
 
 @dataclass(frozen=True)
@@ -222,6 +223,11 @@ def normal_equations(model: WeightedModel, state: State, keep: bool = False) -> 
     )
 
 
+def membership(group: Int[Tensor, "b n"], count: int, dtype: torch.dtype) -> Float[Tensor, "b n g"]:
+    """1 where a motion is of a group; none is for -1."""
+    return torch.nn.functional.one_hot(group + 1, count + 1)[..., 1:].to(dtype)
+
+
 def group_sums(
     model: WeightedModel, state: State, group: Int[Tensor, "b n"], count: int
 ) -> tuple[Float[Tensor, "b g p p"], Float[Tensor, "b g p"]]:
@@ -233,7 +239,7 @@ def group_sums(
             part = model.narrow(trials, motions)
             linear, shaft = linearise(part.measured, at)
             white, _ = _eliminated(part, at, linear, shaft)
-            member = torch.nn.functional.one_hot(group[trials, motions] + 1, count + 1)[..., 1:].to(white.dtype)
+            member = membership(group[trials, motions], count, white.dtype)
             columns_last = white.permute(2, 0, 3, 1)  # (b, k, n, p + 1)
             gram = torch.stack(
                 [(columns_last.mT @ (columns_last * one[:, None, :, None])).sum(1) for one in member.unbind(-1)], dim=1

@@ -9,7 +9,8 @@ from torch import Tensor
 from rmis_calib.errors import InputError
 from rmis_calib.solver.model.batched_linalg import add_cross_, batch_last, cross, dot, rotate
 from rmis_calib.solver.model.measurement_rows import LINE, MeasurementRows, line_points
-from rmis_calib.solver.model.residuals import LinearisedRows, Shaft, State, intrinsic_effects, rcm_axes
+from rmis_calib.solver.model.residuals import LinearisedRows, Shaft, intrinsic_effects, rcm_axes
+from rmis_calib.solver.model.state import State
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import NoiseSettings, UnknownSettings
 
@@ -223,9 +224,7 @@ def columns(
             else:
                 target.copy_(linear.w[:, 1::2])
     for name, part in layout.blocks.items():
-        if name == "intrinsics":
-            by_parameter[part] = intrinsic_effects(measured, state, shaft)
-        elif name not in ("rotation", "translation", "stereo_rotation", "stereo_translation"):
+        if name not in ("rotation", "translation", "stereo_rotation", "stereo_translation"):
             by_parameter[part] = _columns_of(name, linear, shaft, measured, state)
     return out
 

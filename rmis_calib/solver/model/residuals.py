@@ -40,7 +40,7 @@ So every nuisance and every noise source costs scalar products only. `tests/solv
 of this against `torch.func.jacrev`.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 import torch.autograd.forward_ad as forward_ad
@@ -48,88 +48,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rmis_calib.errors import InputError
+from rmis_calib.geometry.cameras import corrected_point
 from rmis_calib.geometry.rotations import rotvec_to_matrix
 from rmis_calib.solver.model.batched_linalg import cross, dot, rotate_trials, unit
 from rmis_calib.solver.model.forward_mode import load_forward_mode
 from rmis_calib.solver.model.measurement_rows import MeasurementRows, OwnRows
+from rmis_calib.solver.model.state import State
 
 MAX_SINE = 0.99
 """Clamp of r/D. A shaft nearer than that would touch the lens; only trial steps get there."""
 MIN_COSINE = 1e-6
 """Smallest T and X_u divided by: a ray along the axis meets it nowhere."""
-
-
-@dataclass(frozen=True)
-class State:
-    """Estimates of `b` trials. The offsets are zero where they are not estimated.
-
-    Attributes:
-        R: `camera_right_R_arm`.
-        t: `camera_right_t_arm`, mm.
-        stereo_R: `camera_left_R_camera_right`.
-        stereo_t: its translation, mm.
-        radius: of the shaft, mm.
-        end_offset: of the shaft's end along the axis, mm.
-        rcm_offset: of the shaft's axis from the nominal RCM, along two directions across the axis, mm.
-        joint_offset: in each joint's unit.
-        clock: seconds added to the time at which the joints were read.
-        edge_bias: shift across its line that a line row of each camera has in every motion alike, normalised units.
-        intrinsics: by how much each camera's points are to be corrected (`corrected_points`).
-    """
-
-    R: Float[Tensor, "b 3 3"]
-    t: Float[Tensor, "b 3"]
-    stereo_R: Float[Tensor, "b 3 3"]
-    stereo_t: Float[Tensor, "b 3"]
-    radius: Float[Tensor, " b"]
-    end_offset: Float[Tensor, " b"]
-    rcm_offset: Float[Tensor, "b 2"]
-    joint_offset: Float[Tensor, "b j"]
-    clock: Float[Tensor, " b"]
-    edge_bias: Float[Tensor, "b l c"]
-    intrinsics: Float[Tensor, "b c 4"]
-
-    def where(self, chosen: Tensor, other: "State") -> "State":
-        """This state in the chosen trials, `other` elsewhere."""
-
-        def pick(a: Tensor, b: Tensor) -> Tensor:
-            return torch.where(chosen.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
-
-        return State(**{f.name: pick(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)})
-
-    def put(self, index: Tensor, part: "State") -> "State":
-        """This state with that of the trials `index` replaced."""
-        return State(
-            **{f.name: getattr(self, f.name).index_copy(0, index, getattr(part, f.name)) for f in fields(self)}
-        )
-
-    def take(self, index: Tensor | slice) -> "State":
-        """The state of the trials `index`."""
-        return State(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
-
-    def moved(self, step: dict[str, Tensor]) -> "State":
-        """The state after a step, given by parameter block (`parameters.ParameterLayout.blocks`)."""
-        changed = {}
-        turns = [name for name in ("rotation", "stereo_rotation") if name in step]
-        angles = [step[name] for name in turns]
-        turned = dict(zip(turns, rotvec_to_matrix(torch.stack(angles)), strict=True)) if turns else {}
-        if "rotation" in step:
-            changed["R"] = turned["rotation"] @ self.R
-        if "stereo_rotation" in step:
-            changed["stereo_R"] = self.stereo_R @ turned["stereo_rotation"]
-        if "stereo_translation" in step:
-            changed["stereo_t"] = self.stereo_t + (self.stereo_R @ step["stereo_translation"][..., None])[..., 0]
-        for block, name in (("translation", "t"), ("rcm_offset", "rcm_offset"), ("joint_offset", "joint_offset")):
-            if block in step:
-                changed[name] = getattr(self, name) + step[block]
-        for name in ("radius", "end_offset", "clock"):
-            if name in step:
-                changed[name] = getattr(self, name) + step[name][:, 0]
-        if "edge_bias" in step:
-            changed["edge_bias"] = self.edge_bias + step["edge_bias"].reshape(self.edge_bias.shape)
-        if "intrinsics" in step:
-            changed["intrinsics"] = self.intrinsics + step["intrinsics"].reshape(self.intrinsics.shape)
-        return replace(self, **changed)
 
 
 @dataclass(frozen=True)
@@ -429,17 +358,11 @@ def _line_geometry(measured: MeasurementRows, state: State, shaft: Shaft, radius
 
 
 def corrected_points(xy: Float[Tensor, "2 *k c b n"], state: State) -> Float[Tensor, "2 *k c b n"]:
-    """Image points as they are once a camera's intrinsics are corrected.
-
-    Normalised points of wrong intrinsics are off by xy q_0 (focal length), (q_1, q_2) (centre) and xy r^2 q_3 (lens),
-    to first order in these, with q the state's `intrinsics` of the camera.
-    """
+    """Image points once each camera's intrinsics are corrected by the state's (`cameras.corrected_point`)."""
     if not _matters(state.intrinsics):
         return xy
-    q = state.intrinsics.permute(2, 1, 0)[..., None]  # (4, c, b, 1)
-    x, y = xy.unbind()
-    scale = q[0] + (x * x + y * y) * q[3]
-    return torch.stack((x + (x * scale + q[1]), y + (y * scale + q[2])))
+    changes = state.intrinsics.permute(2, 1, 0)[..., None].unbind()  # four of (c, b, 1)
+    return torch.stack(corrected_point(*xy.unbind(), *changes))
 
 
 def intrinsic_effects(measured: MeasurementRows, state: State, shaft: Shaft) -> Float[Tensor, "q k b n"]:
