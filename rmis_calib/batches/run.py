@@ -10,20 +10,20 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 from rmis_calib import __version__
-from rmis_calib.batches import cluster
 from rmis_calib.batches.fingerprint import fingerprint, last_change_s, size_bytes
 from rmis_calib.batches.jobs import Job, LeftOut, Task, find_jobs, with_device
-from rmis_calib.batches.lock import locked
 from rmis_calib.batches.settings import BatchSettings
 from rmis_calib.batches.setups import SetupComparison, compare
 from rmis_calib.batches.summary import PAGE, BatchSummary, check_summary_files
 from rmis_calib.batches.task import JobRecord, Order, run_job, write_failure
-from rmis_calib.batches.workers import Event, Limits, cores, free_memory_bytes, run_tasks
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.errors import InputError, OutputError
 from rmis_calib.io.atomic import write_json
 from rmis_calib.io.folders import natural_order
 from rmis_calib.io.outputs import check_apart, check_file, is_json_of, remove_own
+from rmis_calib.parallel import cluster
+from rmis_calib.parallel.lock import locked
+from rmis_calib.parallel.processes import Event, Limits, cores, free_memory_bytes, run_tasks
 from rmis_calib.pipeline.device import require_device
 from rmis_calib.results import CalibrationResult, finite_or_none
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from rmis_calib.batches.workers import Limits, cores, run_tasks
+from rmis_calib.parallel.processes import Limits, cores, run_tasks
 from tests.batches import toy_tasks
 
 LIMITS = Limits(threads=1, memory_bytes=None, timeout_s=None, retries=2)
@@ -70,7 +70,7 @@ def test_workers_end_with_their_parent() -> None:
     """Killed so that it can say nothing to anyone, the parent must leave no process behind that goes on writing."""
     code = (
         "from tests.batches import toy_tasks\n"
-        "from rmis_calib.batches.workers import Limits, run_tasks\n"
+        "from rmis_calib.parallel.processes import Limits, run_tasks\n"
         "if __name__ == '__main__':\n"
         "    for event in run_tasks([600.0], toy_tasks.sleep, 1, Limits(1, None, None, 0)):\n"
         "        print(event.kind, flush=True)\n"

@@ -61,7 +61,7 @@ def test_contracts_say_what_the_design_says() -> None:
     assert rows == [
         ["cli"],
         ["batches", "studies", "viewer"],
-        ["report"],
+        ["report", "parallel"],
         ["pipeline"],
         ["results"],
         ["config"],

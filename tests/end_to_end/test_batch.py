@@ -18,10 +18,10 @@ import pytest
 
 import rmis_calib as rc
 from rmis_calib.batches import JobRecord, plan
-from rmis_calib.batches.lock import HOLDER, locked
 from rmis_calib.batches.summary import TIMES
 from rmis_calib.cli import main
 from rmis_calib.errors import InputError, OutputError
+from rmis_calib.parallel.lock import holder_file, locked
 
 ONE = rc.BatchSettings(workers=1, overlays=1)
 
@@ -146,15 +146,15 @@ def test_nobodys_files_are_lost(tree, tmp_path) -> None:
 def test_one_batch_at_a_time_and_the_dead_do_not_count(tmp_path) -> None:
     with locked(tmp_path) as dead:
         assert dead is None
-        assert json.loads((tmp_path / HOLDER).read_text())["pid"] == os.getpid()
+        assert json.loads(holder_file(tmp_path).read_text())["pid"] == os.getpid()
         code = (
-            "from pathlib import Path\nfrom rmis_calib.batches.lock import locked\n"
+            "from pathlib import Path\nfrom rmis_calib.parallel.lock import locked\n"
             f"with locked(Path({str(tmp_path)!r})): pass"
         )
         other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
         assert other.returncode != 0
         assert f"process {os.getpid()}" in other.stderr
-    (tmp_path / HOLDER).write_text(json.dumps({"host": "theatre", "pid": 7, "since": "yesterday"}))
+    holder_file(tmp_path).write_text(json.dumps({"host": "theatre", "pid": 7, "since": "yesterday"}))
     with locked(tmp_path) as dead:
         assert dead == "a batch on theatre, process 7, since yesterday"
 

@@ -15,8 +15,8 @@ import pytest
 import rmis_calib as rc
 from rmis_calib.batches import JobRecord, run
 from rmis_calib.batches.summary import TIMES
-from rmis_calib.batches.workers import Event
 from rmis_calib.errors import InputError
+from rmis_calib.parallel.processes import Event
 
 pytest.importorskip("distributed", reason="dask.distributed is absent (the extra `cluster`)")
 

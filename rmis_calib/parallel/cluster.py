@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
-from rmis_calib.batches.workers import Event, Limits, Report, Throttled
 from rmis_calib.errors import InputError
+from rmis_calib.parallel.processes import Event, Limits, Report, Throttled
 
 TOPIC = "rmis-calib-progress"
 _REPORT_EVERY_S = 1.0
