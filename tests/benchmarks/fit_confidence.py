@@ -71,8 +71,6 @@ def real(recorder: Recorder) -> list[tuple[list[float], bool, float, int]]:
     """The same of the labelled real frames; stubs, which may be found or not, are left out."""
     labels, rows = read_labels(), []
     for key, image in pictures().items():
-        if "recode" in key[0] and key not in labels:
-            continue
         for settings in LOOKS:
             found = ShaftDetector(settings).detect(torch.from_numpy(image).permute(2, 0, 1)[None].contiguous())
             for rank in found.valid[0].nonzero()[:, 0].tolist():

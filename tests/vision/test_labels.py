@@ -23,9 +23,12 @@ def contours(row: dict[str, str]) -> np.ndarray:
 
 
 def test_kinds_and_frames(rows):
-    assert Counter(row["kind"] for row in rows) == {"shaft": 61, "stub": 7, "sleeve": 15, "strut": 30}
-    recorded = {row["file"] for row in rows if row["file"].startswith("recode_recording") and row["kind"] == "shaft"}
-    assert len(recorded) == 15
+    assert Counter(row["kind"] for row in rows) == {"shaft": 108, "stub": 7, "sleeve": 15, "strut": 30}
+    recorded = Counter(row["file"].split("/")[0] for row in rows if row["kind"] == "shaft")
+    assert recorded == {
+        "frames": 46, "recode_recording": 15, "cwru_jul23": 14,
+        "thrust_recording": 12, "berkeley_b_psm2_mono": 11, "ucsd_easy": 10,
+    }  # fmt: skip
 
 
 def test_contours_are_of_one_cylinder(rows):
@@ -36,7 +39,7 @@ def test_contours_are_of_one_cylinder(rows):
         width = abs(np.cross(np.append([ua, va], 0.0), np.append(edges[1].mean(0) - edges[0].mean(0), 0.0))[2])
         where = f"{row['file']} {row['half']} {row['kind']}"
         assert ua * ub + va * vb > np.cos(np.radians(15.0)), where  # perspective: the widest opens by 12.6 deg
-        assert 20.0 < width < 160.0 and length.min() > 10.0, where
+        assert 15.0 < width < 190.0 and length.min() > 10.0, where
         assert 0.0 < float(row["sigma_px"]) <= 5.0, where
 
 
