@@ -68,7 +68,13 @@ def make_result(
         covariance=covariance if np.isfinite(covariance).all() else None,
         observability=observability_record(
             solution.observability.describe(),
-            (*notes, *_about_tool(solution), *about_groups(consistency), *about_cameras(solution)),
+            (
+                *notes,
+                *_about_tool(solution),
+                *_about_ends(solution),
+                *about_groups(consistency),
+                *about_cameras(solution),
+            ),
         ),
         motions=motions,
         residuals=residuals,
@@ -91,6 +97,19 @@ def _about_tool(solution: Solution) -> tuple[str, ...]:
     return (
         f"The shaft ends {abs(offset):.0f} mm {where} the place that the tool's table tells: does the table belong "
         "to another tool (the wrists of S/Si and Classic instruments are 50 mm apart), or is a wrist's length missing?",
+    )
+
+
+def _about_ends(solution: Solution) -> tuple[str, ...]:
+    """How many shaft ends were left out as they are not those of one place, in words."""
+    if solution.ends_elsewhere is None or not int(solution.ends_elsewhere):
+        return ()
+    left_out, used = int(solution.ends_elsewhere), int(torch.isfinite(solution.residual_ends).sum())
+    if not used:
+        return (f"The {left_out} measured ends of the shaft have no common place along it, and none was used.",)
+    return (
+        f"{left_out} of {left_out + used} measured ends of the shaft are at another place along it than most, and were "
+        "left out (the ring of the tube in some pictures, the metal's tip or what lies over it in others?).",
     )
 
 

@@ -159,6 +159,12 @@ class Problem:
         )
         return replace(self, **{name: getattr(self, name).narrow(start, 0, count) for name in names})
 
+    @property
+    def end_measured(self) -> Bool[Tensor, "*batch c n"]:
+        """Which shaft ends are measured, at a place that the kinematics tell."""
+        known = torch.isfinite(self.rcm_s_end_mm)[..., None, :]
+        return torch.isfinite(self.end_xy).all(-1) & self.valid & known
+
     def select_motions(self, index: Tensor | slice) -> "Problem":
         """The problem of the motions `index` (positions, a mask or a slice), the same for every trial."""
         return self._map_motions(lambda x, dim: x[(slice(None),) * dim + (index,)])

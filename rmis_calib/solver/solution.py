@@ -137,6 +137,7 @@ class Solution:
         residual_lines, residual_ends, residual_heads: rms per camera and motion, normalised units; NaN where not
             measured.
         residual_own: the same of the user's own measurements, by name, in their unit.
+        ends_elsewhere: number of measured shaft ends that are not at the place of most, and were left out.
         distance: Mahalanobis distance of each motion over the root of its rows; NaN where not measured.
         reason: `MotionReason` codes.
         noise: levels that were used, name -> value (`image`, `ends`, `heads` as factors on the nominal ones).
@@ -167,6 +168,7 @@ class Solution:
     bias: Float[Tensor, "*batch 6"]
     observability: ObservabilityTensors
     residual_own: dict[str, Float[Tensor, "*batch n"]] = field(default_factory=dict)
+    ends_elsewhere: Int[Tensor, "*batch"] | None = None
     posterior: Posterior | None = None
     groups: GroupCheck | None = None
     history: tuple[Float[Tensor, "..."], ...] = ()

@@ -137,6 +137,7 @@ def joint_solution(fit: MapEstimate, settings: SolverSettings, alternative: Alte
         residual_ends=shown.ends,
         residual_heads=shown.heads,
         residual_own=shown.own,
+        ends_elsewhere=fit.problem.end_measured.sum((1, 2)) - measured.end_ok.sum((0, 2)),
     )
 
 

@@ -10,26 +10,25 @@ from torch import Tensor
 from rmis_calib.errors import InsufficientDataError
 from rmis_calib.solver.estimate.bias import expected_score
 from rmis_calib.solver.estimate.gauss_newton import Refined, gauss_newton
-from rmis_calib.solver.estimate.multistart import any_free, cheirality, multistart
-from rmis_calib.solver.estimate.noise_levels import assumed_noise, estimate_components
+from rmis_calib.solver.estimate.multistart import cheirality, multistart
+from rmis_calib.solver.estimate.noise_levels import assumed_noise
+from rmis_calib.solver.estimate.noise_modes import settle_noise
 from rmis_calib.solver.estimate.one_step_update import one_step_update
-from rmis_calib.solver.estimate.outliers import REJECTED, anneal, classify
+from rmis_calib.solver.estimate.outliers import REJECTED, classify, classify_contaminated
+from rmis_calib.solver.estimate.trusted_ends import trusted_ends
 from rmis_calib.solver.model.batched_linalg import rescaled, unit_diagonal
 from rmis_calib.solver.model.measurement_rows import MeasurementRows, pack
-from rmis_calib.solver.model.normal_equations import NoiseModel, Normal, WeightedModel, with_prior
+from rmis_calib.solver.model.normal_equations import Normal, WeightedModel, with_prior
 from rmis_calib.solver.model.parameters import NuisancePriors, initial_state, make_layout
 from rmis_calib.solver.model.state import State
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import SolverSettings
 
-SAMPLE_MOTIONS = 512
-"""Motions on which outliers are annealed and noise levels estimated; all motions are classified afterwards."""
 LONG = 32768
 """Motions of a single recording from which a sample is solved to the end and all motions then give one step..."""
 LONG_SAMPLE = 8192
 """...from this many: the step is a few of its standard errors, and what is left after it is below a thousandth of
 one."""
-NOISE_ROUNDS = 2
 MAX_PASSES = 12
 MOSTLY_PRIOR = 0.9
 """Share of a direction's information from which it is the prior's: a bias there is not corrected."""
@@ -92,21 +91,23 @@ def map_estimate(problem: Problem, settings: SolverSettings, start: "MapEstimate
     order = motion_order(measured, settings.seed)
     if measured.trials == 1 and measured.motions > LONG and start is None:
         first = map_estimate(problem.select_motions(order[:LONG_SAMPLE]), replace(settings, bias_correction=False))
-        model = replace(first.model, measured=measured, weight=None)
+        model = replace(first.model, measured=trusted_ends(measured, first.state, assumed), weight=None)
         refined, weight = one_step_update(model, first.state, settings, first.covariance)
         if refined is not None:
             return _finish(problem, replace(model, weight=weight), refined, settings)
     if start is None:
         state, noise, contaminated = multistart(problem, measured, order, assumed, free, settings)
+        measured = trusted_ends(measured, state, assumed)
     else:
         state, noise, contaminated = start.state, start.model.noise, (start.weight < REJECTED).any(-1).any(0)
+        measured = measured.with_ends_of(start.model.measured)
     nominal = NuisancePriors.of(problem)
     fresh = initial_state(nominal, state.R, state.t)
     layout = make_layout(nominal, measured, fresh, settings.unknowns, settings.noise)
     model = WeightedModel(measured, layout, noise, chunk=settings.chunk)
     state = fresh if start is not None else state
     _check_rows(measured)
-    state, noise = _settle_noise(model, state, order, contaminated, assumed, free, settings)
+    state, noise = settle_noise(model, state, order, contaminated, assumed, free, settings)
     model = replace(model, noise=noise)
     refined, weight = _refine_all(model, state, contaminated | (settings.robust == "on"), settings)
     return _finish(problem, replace(model, weight=weight), refined, settings)
@@ -118,44 +119,12 @@ def motion_order(measured: MeasurementRows, seed: int) -> Int[Tensor, " n"]:
     return torch.randperm(measured.motions, generator=generator).to(measured.p.device)
 
 
-def _settle_noise(
-    model: WeightedModel,
-    state: State,
-    order: Tensor,
-    contaminated: Bool[Tensor, " b"],
-    assumed: NoiseModel,
-    free: dict[str, Tensor],
-    settings: SolverSettings,
-) -> tuple[State, NoiseModel]:
-    """Outliers annealed away, in the contaminated trials, and noise levels estimated on a sample."""
-    sample = model.take_motions(order[:SAMPLE_MOTIONS]) if model.measured.motions > SAMPLE_MOTIONS else model
-    at = torch.nonzero(contaminated)[:, 0]
-    if len(at):
-        part, _ = anneal(sample.take_trials(at), state.take(at), settings.outlier_probability)
-        state = state.put(at, part)
-    for _ in range(NOISE_ROUNDS if any_free(free) else 0):
-        weight = _classified(sample, state, contaminated, settings.outlier_probability)
-        sample = replace(sample, weight=weight)
-        sample = replace(sample, noise=estimate_components(sample, state, assumed, free, settings.noise))
-        state = gauss_newton(sample, state, 0.1, 4).state
-    return state, sample.noise
-
-
-def _classified(
-    model: WeightedModel, state: State, contaminated: Bool[Tensor, " b"], probability: float
-) -> Float[Tensor, "c b n"] | None:
-    """Weights of the contaminated trials; 1 in the others, and None where there are no contaminated ones."""
-    if not bool(contaminated.any()):
-        return None
-    return torch.where(contaminated[:, None], classify(model, state, probability), 1.0)
-
-
 def _refine_all(
     model: WeightedModel, state: State, contaminated: Bool[Tensor, " b"], settings: SolverSettings
 ) -> tuple[Refined, Float[Tensor, "c b n"] | None]:
     """Estimate from all motions, and the weights where something was rejected."""
     probability, tolerance = settings.outlier_probability, settings.tolerance_sigma
-    weight = _classified(model, state, contaminated, probability)
+    weight = classify_contaminated(model, state, contaminated, probability)
     refined = gauss_newton(replace(model, weight=weight), state, tolerance, MAX_PASSES)
     if settings.robust == "off":
         return refined, None

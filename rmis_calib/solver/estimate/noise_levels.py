@@ -21,7 +21,7 @@ from torch import Tensor
 
 from rmis_calib.solver.model.batched_linalg import rescaled, unit_diagonal
 from rmis_calib.solver.model.measurement_rows import END, HEAD, LINE, MeasurementRows
-from rmis_calib.solver.model.normal_equations import NoiseModel, WeightedModel, covariance, image_variance
+from rmis_calib.solver.model.normal_equations import NoiseModel, WeightedModel, accumulate, covariance, image_variance
 from rmis_calib.solver.model.parameters import ParameterLayout, columns
 from rmis_calib.solver.model.residuals import LinearisedRows, linearise
 from rmis_calib.solver.model.state import State
@@ -86,7 +86,7 @@ def estimate_components(
     centre, prior = log_prior(assumed, settings)
     active = free_mask.any(-1, keepdim=True)
     for _ in range(SCORING_STEPS):
-        theta = torch.stack([getattr(noise, name) for name in COMPONENTS], dim=-1).clamp_min(1e-30).log()
+        theta = log_levels(noise)
         score, fisher = _score(measured, linear, J, r, noise, parts, layout)
         v = theta.exp()
         score = v * score - prior * (theta - centre)
@@ -113,8 +113,20 @@ def free_components(measured: MeasurementRows, free: dict[str, Tensor]) -> Bool[
 
 def log_prior(assumed: NoiseModel, settings: NoiseSettings) -> tuple[Float[Tensor, "b m"], float]:
     """Centre of the prior of each component's logarithm, and its weight 1/sigma^2."""
-    centre = torch.stack([getattr(assumed, name) for name in COMPONENTS], dim=-1).clamp_min(1e-30).log()
-    return centre, (2.0 * math.log(settings.prior_factor)) ** -2
+    return log_levels(assumed), (2.0 * math.log(settings.prior_factor)) ** -2
+
+
+def log_levels(noise: NoiseModel) -> Float[Tensor, "b m"]:
+    """Logarithm of each component's variance."""
+    return torch.stack([getattr(noise, name) for name in COMPONENTS], dim=-1).clamp_min(1e-30).log()
+
+
+def restricted_likelihood(model: WeightedModel, state: State) -> Float[Tensor, " b"]:
+    """Log of the restricted likelihood of the noise levels, up to a constant."""
+    normal = accumulate(model, state)
+    scaled, scale = unit_diagonal(normal.H)
+    logdet_H = torch.linalg.slogdet(scaled).logabsdet - 2.0 * scale.log().sum(-1)
+    return -0.5 * (normal.chi2 + normal.logdet + logdet_H)
 
 
 def _present(measured: MeasurementRows) -> Tensor:

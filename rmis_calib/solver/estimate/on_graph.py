@@ -12,8 +12,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rmis_calib.solver.estimate.map_estimate import SAMPLE_MOTIONS, MapEstimate, debias, motion_order
-from rmis_calib.solver.estimate.noise_levels import COMPONENTS, assumed_noise, free_components, log_prior
+from rmis_calib.solver.estimate.map_estimate import MapEstimate, debias, motion_order
+from rmis_calib.solver.estimate.noise_levels import (
+    COMPONENTS,
+    assumed_noise,
+    free_components,
+    log_levels,
+    log_prior,
+    restricted_likelihood,
+)
+from rmis_calib.solver.estimate.noise_modes import SAMPLE_MOTIONS
 from rmis_calib.solver.model.batched_linalg import rescaled, unit_diagonal
 from rmis_calib.solver.model.implicit import newton_on_graph
 from rmis_calib.solver.model.measurement_rows import pack
@@ -47,7 +55,7 @@ def attach(problem: Problem, fit: MapEstimate, settings: SolverSettings) -> Esti
         fit: the estimate; made of tensors that autograd may use (not of inference mode).
         settings: those of `fit`.
     """
-    measured = replace(pack(problem, settings.noise), exact=True)
+    measured = replace(pack(problem, settings.noise), exact=True).with_ends_of(fit.model.measured)
     assumed, free = assumed_noise(problem, settings.noise)
     nominal = NuisancePriors.of(problem)
     fresh = initial_state(nominal, fit.state.R, fit.state.t)
@@ -60,24 +68,24 @@ def attach(problem: Problem, fit: MapEstimate, settings: SolverSettings) -> Esti
     estimated = free_components(sample.measured, free)
     centre, prior = log_prior(assumed, settings.noise)
 
-    def noise_at(log_levels: Tensor) -> NoiseModel:
+    def noise_at(theta: Tensor) -> NoiseModel:
         given = torch.stack([getattr(assumed, name) for name in COMPONENTS], dim=-1)
-        levels = torch.where(estimated, log_levels.exp(), given)
+        levels = torch.where(estimated, theta.exp(), given)
         return replace(assumed, **{name: levels[:, i] for i, name in enumerate(COMPONENTS)})
 
-    def equations(state: State, log_levels: Tensor, step: Tensor) -> Tensor:
+    def equations(state: State, theta: Tensor, step: Tensor) -> Tensor:
         """Score of the parameters, then of the logarithms of the noise levels, after a step from both."""
-        at, theta = state.moved(layout.step(step[:, : layout.size])), log_levels + step[:, layout.size :]
+        at, theta = state.moved(layout.step(step[:, : layout.size])), theta + step[:, layout.size :]
         score = accumulate(replace(model, noise=noise_at(theta)), at).g
         if not bool(estimated.any()):
             return torch.cat((score, step[:, layout.size :]), dim=-1)
-        likelihood = _restricted_likelihood(replace(sample, noise=noise_at(theta)), at)
+        likelihood = restricted_likelihood(replace(sample, noise=noise_at(theta)), at)
         (slope,) = torch.autograd.grad(likelihood.sum(), theta, create_graph=True)
         of_noise = torch.where(estimated, prior * (theta - centre) - slope, step[:, layout.size :])
         return torch.cat((score, of_noise), dim=-1)
 
     undone = layout.step(fit.bias)
-    state, theta = fit.state.moved(undone), _log_levels(fit.model.noise)
+    state, theta = fit.state.moved(undone), log_levels(fit.model.noise)
     sigma = torch.cat((_sigma(fit.covariance), torch.ones_like(theta)), dim=-1)
     step = torch.zeros_like(sigma)
     for _ in range(MAX_STEPS):
@@ -98,20 +106,8 @@ def attach(problem: Problem, fit: MapEstimate, settings: SolverSettings) -> Esti
     return EstimateOnGraph(state, _inverse(information, fit.covariance), normal.chi2)
 
 
-def _log_levels(noise: NoiseModel) -> Float[Tensor, "b m"]:
-    return torch.stack([getattr(noise, name) for name in COMPONENTS], dim=-1).clamp_min(1e-30).log()
-
-
 def _sigma(covariance: Float[Tensor, "b p p"]) -> Float[Tensor, "b p"]:
     return covariance.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).sqrt()
-
-
-def _restricted_likelihood(model: WeightedModel, state: State) -> Float[Tensor, " b"]:
-    """Log of the restricted likelihood of the noise levels, up to a constant (noise_levels.py)."""
-    normal = accumulate(model, state)
-    scaled, scale = unit_diagonal(normal.H)
-    logdet_H = torch.linalg.slogdet(scaled).logabsdet - 2.0 * scale.log().sum(-1)
-    return -0.5 * (normal.chi2 + normal.kept_logdet + logdet_H)
 
 
 def _inverse(information: Float[Tensor, "b p p"], fallback: Float[Tensor, "b p p"]) -> Float[Tensor, "b p p"]:

@@ -16,7 +16,7 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.special import chdtri
 from torch import Tensor
 
@@ -117,3 +117,12 @@ def classify(
         ]
         weights.append(torch.cat(parts, dim=2))
     return torch.cat(weights, dim=1)
+
+
+def classify_contaminated(
+    model: WeightedModel, state: State, contaminated: Bool[Tensor, " b"], probability: float
+) -> Float[Tensor, "c b n"] | None:
+    """Weights of the contaminated trials; 1 in the others, and None where there are no contaminated ones."""
+    if not bool(contaminated.any()):
+        return None
+    return torch.where(contaminated[:, None], classify(model, state, probability), 1.0)

@@ -202,6 +202,14 @@ class MeasurementRows:
             return self
         return self.take_trials(torch.arange(self.trials, device=self.p.device).repeat_interleave(times))
 
+    def with_ends_of(self, other: "MeasurementRows") -> "MeasurementRows":
+        """Only those shaft ends that the other rows, of the same motions, have too."""
+        if not other.has_ends:
+            return replace(
+                self, **{name: getattr(self, name)[..., :0, :, :] for name in ("end_xy", "end_var", "end_ok")}
+            )
+        return replace(self, end_ok=self.end_ok & other.end_ok)
+
     def keep(self, camera_ok: Bool[Tensor, "c b n"]) -> "MeasurementRows":
         """Measurements of other cameras and motions marked as not measured."""
         return replace(
@@ -219,9 +227,8 @@ def pack(problem: Problem, noise: NoiseSettings) -> MeasurementRows:
     arm_R_rcm = batch_last(problem.arm_T_rcm[..., :3, :3], 2)
     head_rcm = torch.nan_to_num(batch_last(problem.rcm_p_head, 1))
     line = _lines(problem, image)
-    ends_known = torch.isfinite(problem.rcm_s_end_mm)
     heads_known = torch.isfinite(problem.rcm_p_head).all(-1)
-    end_xy, end_var, end_ok = _points(problem.end_xy, problem.end_sigma, problem.valid & ends_known[:, None], image)
+    end_xy, end_var, end_ok = _points(problem.end_xy, problem.end_sigma, problem.end_measured, image)
     head_xy, head_var, head_ok = _points(
         problem.head_xy, problem.head_sigma, problem.valid & heads_known[:, None], image
     )

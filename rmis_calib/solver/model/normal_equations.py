@@ -112,7 +112,7 @@ class Normal:
         chi2: r^T S^-1 r.
         rows: number of measured rows.
         distance2: r^T S^-1 r of each motion.
-        logdet: log det S, summed over motions; only where autograd looks on.
+        logdet: log det S, summed over motions.
         factor: the eliminated systems, for `frozen_chi2`, when asked for.
         linear: the rows that these are of, likewise.
     """
@@ -122,16 +122,9 @@ class Normal:
     chi2: Float[Tensor, " b"]
     rows: Float[Tensor, " b"]
     distance2: Float[Tensor, "b n"]
-    logdet: Float[Tensor, " b"] | None = None
+    logdet: Float[Tensor, " b"]
     factor: Tensor | None = None
     linear: LinearisedRows | None = None
-
-    @property
-    def kept_logdet(self) -> Tensor:
-        """The determinant of normal equations that autograd looks on."""
-        if self.logdet is None:
-            raise InputError(where="Normal.logdet", expected="tensors that require a gradient", found="none")
-        return self.logdet
 
     @property
     def kept_factor(self) -> Tensor:
@@ -203,13 +196,14 @@ def normal_equations(model: WeightedModel, state: State, keep: bool = False) -> 
     measured, layout = model.measured, model.layout
     linear, shaft = linearise(measured, state)
     p = layout.size
-    factor = logdet = None
+    factor = None
     if linear.r.requires_grad:
         image = image_variance(measured, model.noise)
         J = columns(layout, linear, shaft, measured, state)
         white, logdet = _whitened(model, linear, image, torch.cat((J, linear.r[:, None]), dim=1))
     else:
         white, factor = _eliminated(model, state, linear, shaft)
+        logdet = factor.diagonal(dim1=0, dim2=1).log().sum((-2, -1))
     gram = torch.matmul(white.permute(0, 2, 1, 3), white.permute(0, 2, 3, 1)).sum(0)  # (b, p + 1, p + 1)
     return Normal(
         H=gram[:, :p, :p],
@@ -337,8 +331,7 @@ def _joined(parts: list[Normal]) -> Normal:
 
 def _sums_of(parts: list[Normal]) -> list[str]:
     """What is a sum over motions in these parts."""
-    names = ["H", "g", "chi2", "rows", "logdet"]
-    return [name for name in names if getattr(parts[0], name) is not None]
+    return ["H", "g", "chi2", "rows", "logdet"]
 
 
 def motion_distance2(measured: MeasurementRows, state: State, noise: NoiseModel) -> Float[Tensor, "b n"]:
