@@ -77,7 +77,11 @@ def _inputs(job: Job) -> Iterator[tuple[str, Path]]:
         raw = load_yaml(job.source / DESCRIPTION)
     except RmisCalibError:
         return
-    for key, value in raw.items():
+    entries = [(key, value) for key, value in raw.items() if not isinstance(value, dict)]
+    entries += [
+        (f"{key}.{part}", v) for key, value in raw.items() if isinstance(value, dict) for part, v in value.items()
+    ]
+    for key, value in entries:
         if isinstance(value, str) and "\0" not in value and (job.source / value).exists():
             path = job.source / value
             if not path.resolve().is_relative_to(job.source.resolve()):

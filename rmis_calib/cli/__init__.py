@@ -21,7 +21,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "compare": ("Compare", "pool results of one set-up, test whether they agree, name what does not fit"),
     "solve": ("Solve", "estimate camera_right_T_arm from an observations file (.npz)"),
     "evaluate": ("Evaluate", "measure a result against head points and against a truth file"),
+    "cameras show": ("CamerasShow", "print a camera file of any known format as stereo.yaml, and draw it"),
 }
+"""Class in cli/commands.py and what it does, by name; a name of two words is one of a group."""
 
 EXIT_OK, EXIT_NOT_TRUSTWORTHY, EXIT_BAD_INPUT, EXIT_BUG, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -38,19 +40,19 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(argv: list[str]) -> int:
     if argv and argv[0] == "help":
-        argv = [*argv[1:2], "--help"]
+        argv = [*argv[1:], "--help"]
     if not argv or argv[0] in ("-h", "--help"):
         print(_overview())
         return EXIT_OK if argv else EXIT_BAD_INPUT
     if argv[0] in ("--version", "-V"):
         print(f"rmis-calib {__version__}")
         return EXIT_OK
-    if argv[0] not in COMMANDS:
-        near = difflib.get_close_matches(argv[0], COMMANDS, n=1)
-        hint = f" (did you mean {near[0]}?)" if near else ""
-        return _fail(f"unknown command {argv[0]!r}{hint}; expected one of {', '.join(COMMANDS)}")
+    words = 2 if " ".join(argv[:2]) in COMMANDS else 1
+    name, arguments = " ".join(argv[:words]), argv[words:]
+    if name not in COMMANDS:
+        return _not_a_command(argv)
     try:
-        command = import_module("rmis_calib.cli.commands").parse(COMMANDS[argv[0]][0], argv[0], argv[1:])
+        command = import_module("rmis_calib.cli.commands").parse(COMMANDS[name][0], name, arguments)
     except SystemExit as exit_request:  # tyro has printed the help
         return int(exit_request.code or 0)
     except Exception as error:
@@ -62,6 +64,20 @@ def _run(argv: list[str]) -> int:
         return EXIT_INTERRUPTED
     except Exception as error:
         return _report(error)
+
+
+def _not_a_command(argv: list[str]) -> int:
+    """What a group holds, or the nearest command's name."""
+    group = [name for name in COMMANDS if name.startswith(f"{argv[0]} ")]
+    if group and argv[1:] == ["--help"]:
+        print("\n".join(f"rmis-calib {name}: {COMMANDS[name][1]}" for name in group))
+        return EXIT_OK
+    if group:
+        found = repr(argv[1]) if len(argv) > 1 else "nothing"
+        return _fail(f"rmis-calib {argv[0]}: expected one of {', '.join(group)}, found {found}")
+    near = difflib.get_close_matches(argv[0], COMMANDS, n=1)
+    hint = f" (did you mean {near[0]}?)" if near else ""
+    return _fail(f"unknown command {argv[0]!r}{hint}; expected one of {', '.join(COMMANDS)}")
 
 
 def _report(error: Exception) -> int:
@@ -87,7 +103,7 @@ def _fail(message: str) -> int:
 def _overview() -> str:
     lines = [f"rmis-calib {__version__}: markerless hand-eye calibration of a stereo laparoscope", ""]
     lines += ["usage: rmis-calib COMMAND [OPTIONS]     (rmis-calib help COMMAND for one command's options)", ""]
-    lines += [f"  {name:<10} {sentence}" for name, (_, sentence) in COMMANDS.items()]
+    lines += [f"  {name:<13} {sentence}" for name, (_, sentence) in COMMANDS.items()]
     lines += [
         "",
         "exit codes: 0 trustworthy result, 1 no trustworthy result, 2 bad usage or input, 3 a bug, 130 interrupted",

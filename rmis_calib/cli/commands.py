@@ -19,6 +19,7 @@ from rmis_calib.cli.batch_console import (
     stopped_by_signal,
 )
 from rmis_calib.cli.console import ProgressCallback, conclude, print_table, progress_reporter, say
+from rmis_calib.cli.equipment import CamerasShow as CamerasShow
 from rmis_calib.cli.paths import beside, check_output_folder, setting_inputs
 from rmis_calib.cli.usage import parse_arguments
 from rmis_calib.config import CalibrationConfig, load_config

@@ -1,14 +1,15 @@
-"""Pinhole cameras with Brown-Conrady distortion, and the stereo rig. Every projection says where it is valid."""
+"""Cameras with a lens model (lens_profiles.py), and the stereo rig. Every projection says where it is valid."""
 
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rmis_calib.errors import InputError, ShapeError
+from rmis_calib.geometry.lens_models import COEFFICIENTS, LensModel
+from rmis_calib.geometry.lens_profiles import PROFILES, fold_radius_squared
 from rmis_calib.geometry.rigid import RigidTransform
 
 # Largest undistorted radius x/z that the model is used for: 89.4 degrees off axis. It keeps r^7 finite in single
@@ -26,7 +27,7 @@ class Camera:
     Convention: OpenCV. uv = (fx x_d + cx, fy y_d + cy) with (x_d, y_d) the distorted normalised point.
 
     Raises:
-        ShapeError: an intrinsic is not a 0-d tensor or `distortion` does not have 5 entries.
+        ShapeError: an intrinsic is not a 0-d tensor, or `distortion` has another number of entries than its model.
         InputError: a focal length or a side of the image is not positive, or something is not finite.
     """
 
@@ -39,12 +40,17 @@ class Camera:
     cy: Tensor
     """Principal point, v, px, 0-d."""
     distortion: Tensor
-    """k1, k2, p1, p2, k3 (OpenCV's order), (5,)."""
+    """In OpenCV's order: k1, k2, p1, p2, k3 (plumb_bob), the same and k4, k5, k6 (rational_polynomial), or k1 to k4
+    (equidistant)."""
     image_size: tuple[int, int]
     """(height, width), px."""
+    model: LensModel = "plumb_bob"
 
     def __post_init__(self) -> None:
-        for name, shape in {"fx": (), "fy": (), "cx": (), "cy": (), "distortion": (5,)}.items():
+        if self.model not in COEFFICIENTS:
+            raise InputError(where="camera model", expected=f"one of {', '.join(COEFFICIENTS)}", found=self.model)
+        coefficients = (COEFFICIENTS[self.model],)
+        for name, shape in {"fx": (), "fy": (), "cx": (), "cy": (), "distortion": coefficients}.items():
             value = getattr(self, name)
             if tuple(value.shape) != shape:
                 raise ShapeError(where=f"camera {name}", expected=f"shape {shape}", found=tuple(value.shape))
@@ -68,31 +74,36 @@ class Camera:
         distortion: tuple[float, ...] | list[float] = (0.0, 0.0, 0.0, 0.0, 0.0),
         *,
         image_size: tuple[int, int],
+        model: LensModel = "plumb_bob",
         dtype: torch.dtype = torch.float64,
         device: torch.device | str = "cpu",
     ) -> "Camera":
         """Camera from plain numbers; `image_size` is (height, width)."""
         tensors = [torch.tensor(value, dtype=dtype, device=device) for value in (fx, fy, cx, cy, list(distortion))]
-        return cls(*tensors, image_size=image_size)
+        return cls(*tensors, image_size=image_size, model=model)
 
     @property
     def focal(self) -> Float[Tensor, ""]:
         """Mean focal length, px: turns a small normalised length into pixels."""
         return 0.5 * (self.fx + self.fy)
 
+    @property
+    def distorts(self) -> bool:
+        """Whether the picture differs from a pinhole camera's."""
+        return self.model == "equidistant" or bool((self.distortion != 0).any())
+
     @cached_property
     def max_radius_squared(self) -> float:
         """Square of the undistorted radius up to which the radial distortion grows; beyond, the image folds back."""
-        k1, k2, _, _, k3 = self.distortion.detach().cpu().double().tolist()
-        # Roots in s = r^2 of d/dr (r + k1 r^3 + k2 r^5 + k3 r^7) = 1 + 3 k1 s + 5 k2 s^2 + 7 k3 s^3.
-        roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
-        positive = [root.real for root in roots if abs(root.imag) < 1e-9 * abs(root) and root.real > 0]
-        return min([*positive, _MAX_RADIUS_SQUARED])
+        return min(
+            fold_radius_squared(self.model, self.distortion.detach().cpu().double().tolist()), _MAX_RADIUS_SQUARED
+        )
 
     def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> "Camera":
         """The same camera in another precision or on another device."""
         values = (self.fx, self.fy, self.cx, self.cy, self.distortion)
-        return Camera(*(value.to(dtype=dtype, device=device) for value in values), image_size=self.image_size)
+        moved = (value.to(dtype=dtype, device=device) for value in values)
+        return Camera(*moved, image_size=self.image_size, model=self.model)
 
     def corrected(self, focal: float, centre_x: float, centre_y: float, lens: float) -> "Camera":
         """The camera whose undistorted points are `corrected_points` of this one's, to first order.
@@ -100,18 +111,22 @@ class Camera:
         Args:
             focal: relative change of the points' scale: the focal length falls by it.
             centre_x, centre_y: shift of the points, in focal lengths.
-            lens: growth of the points by r^2 times this: k1 falls by it.
+            lens: growth of the points by r^2 times this: k1, of whatever model, falls by it.
         """
         fx, fy = self.fx / (1.0 + focal), self.fy / (1.0 + focal)
-        distortion = self.distortion - lens * torch.eye(5, dtype=self.fx.dtype, device=self.fx.device)[0]
-        return Camera(fx, fy, self.cx - centre_x * fx, self.cy - centre_y * fy, distortion, self.image_size)
+        only_k1 = torch.zeros_like(self.distortion)
+        only_k1[0] = 1.0
+        distortion = self.distortion - lens * only_k1
+        return Camera(fx, fy, self.cx - centre_x * fx, self.cy - centre_y * fy, distortion, self.image_size, self.model)
 
     def distort(self, xy: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
         """Distorted normalised coordinates. Meaningful where `can_distort` holds."""
-        k1, k2, p1, p2, k3 = self.distortion.unbind(-1)
         x, y = xy.unbind(-1)
         r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        radial, _ = PROFILES[self.model](r2, self.distortion)
+        if self.model == "equidistant":
+            return xy * radial[..., None]
+        p1, p2 = self.distortion[2], self.distortion[3]
         x_d = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
         y_d = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
         return torch.stack([x_d, y_d], dim=-1)
@@ -189,14 +204,15 @@ class Camera:
         return (inverse @ (self.distort(xy) - target)[..., None])[..., 0]
 
     def _distortion_jacobian(self, xy: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2 2"]:
-        k1, k2, p1, p2, k3 = self.distortion.unbind(-1)
         x, y = xy.unbind(-1)
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # d radial / dx = slope * x
-        xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
-        mixed = slope * x * y + 2 * p1 * x + 2 * p2 * y
-        yy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+        radial, radial_slope = PROFILES[self.model](x * x + y * y, self.distortion)
+        slope = 2 * radial_slope  # d radial / dx = slope * x
+        xx, mixed, yy = radial + slope * x * x, slope * x * y, radial + slope * y * y
+        if self.model != "equidistant":
+            p1, p2 = self.distortion[2], self.distortion[3]
+            xx = xx + 2 * p1 * y + 6 * p2 * x
+            mixed = mixed + 2 * p1 * x + 2 * p2 * y
+            yy = yy + 6 * p1 * y + 2 * p2 * x
         return torch.stack([xx, mixed, mixed, yy], dim=-1).unflatten(-1, (2, 2))
 
 

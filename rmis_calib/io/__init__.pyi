@@ -24,6 +24,8 @@ from .robot import HeadPoint as HeadPoint
 from .robot import Joint as Joint
 from .robot import Robot as Robot
 from .robot import load_robot as load_robot
+from .stereo import read_camera_pair as read_camera_pair
+from .stereo import read_stereo as read_stereo
 from .tables import HeadPoints as HeadPoints
 from .video import FrameBatch as FrameBatch
 from .video import FrameSource as FrameSource

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
+from rmis_calib.geometry.lens_models import COEFFICIENTS, LensModel
 from rmis_calib.robot import DhConvention, JointType
 
 METRES = "looks like metres; write millimetres"
@@ -54,10 +55,17 @@ class Schema(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
 
 
+class CameraPairSchema(Schema):
+    """Two files of one camera each, as ROS writes them."""
+
+    right: FileName
+    left: FileName
+
+
 class RecordingSchema(Schema):
     format: Literal["rmis-calib/1"]
     robot: FileName
-    stereo: FileName
+    stereo: FileName | CameraPairSchema
     right: FileName
     left: FileName | None = None
     joints: FileName
@@ -71,6 +79,11 @@ class RecordingSchema(Schema):
     crop_right: Crop | None = None
     crop_left: Crop | None = None
     rolling_shutter_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+
+    @property
+    def stereo_files(self) -> tuple[str, ...]:
+        """The files that `stereo` names, the right camera's first."""
+        return (self.stereo.right, self.stereo.left) if isinstance(self.stereo, CameraPairSchema) else (self.stereo,)
 
     @property
     def is_stereo(self) -> bool:
@@ -99,7 +112,20 @@ class CameraSchema(Schema):
     fy: Annotated[float, Field(gt=0)]
     cx: float
     cy: float
-    distortion: Annotated[list[float], Field(min_length=5, max_length=5)]
+    distortion_model: LensModel = "plumb_bob"
+    distortion: list[float]
+
+    @model_validator(mode="after")
+    def _as_many_as_the_model_has(self) -> "CameraSchema":
+        expected = COEFFICIENTS[self.distortion_model]
+        if len(self.distortion) != expected:
+            others = [model for model, count in COEFFICIENTS.items() if count == len(self.distortion)]
+            hint = f" (distortion_model: {others[0]}?)" if others else ""
+            raise ValueError(
+                f"expected {expected} entries of distortion for {self.distortion_model}, "
+                f"found {len(self.distortion)}{hint}"
+            )
+        return self
 
 
 class StereoSchema(Schema):

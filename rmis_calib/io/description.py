@@ -11,14 +11,15 @@ import numpy as np
 from rmis_calib.errors import InputError, RecordingError, RobotError, VideoError
 from rmis_calib.io._checks import Note
 from rmis_calib.io._eyes import EyeReader
-from rmis_calib.io._schemas import RecordingSchema
+from rmis_calib.io._schemas import CameraPairSchema, RecordingSchema
 from rmis_calib.io.clocks import check_overlap, on_one_clock
 from rmis_calib.io.configs import load_yaml
 from rmis_calib.io.folders import DESCRIPTION, recording_folder
+from rmis_calib.io.intrinsics import Intrinsics, StereoFile
 from rmis_calib.io.joints import JointLog, load_joints
 from rmis_calib.io.readers import Reader, open_reader
 from rmis_calib.io.robot import load_robot
-from rmis_calib.io.stereo import Intrinsics, StereoFile, read_stereo
+from rmis_calib.io.stereo import read_camera_pair, read_stereo
 from rmis_calib.io.tables import HeadPoints, read_frame_times, read_head_points
 from rmis_calib.io.validation import validate
 from rmis_calib.robot import Robot
@@ -67,7 +68,7 @@ def read_description(path: str | Path, clock_offset_s: float | None = None) -> R
         raise InputError(where="clock_offset_s", expected="a finite number of seconds", found=offset)
     notes: list[str] = []
     robot = _load_robot(schema, folder, notes.append)
-    stereo = _cameras(schema, read_stereo(folder / schema.stereo, notes.append), where)
+    stereo = _cameras(schema, _read_cameras(schema, folder, notes.append), where)
     arms = tuple(arm for arm in (schema.laparoscope_arm, schema.instrument_arm) if arm is not None)
     joints = load_joints(folder / schema.joints, robot, arms, notes.append)
     listed_s = None if schema.frame_times is None else read_frame_times(folder / schema.frame_times)
@@ -79,7 +80,7 @@ def read_description(path: str | Path, clock_offset_s: float | None = None) -> R
     head_path = folder / "head_points.csv"
     size = stereo.right.image_size
     heads = read_head_points(head_path, len(frame_times_s), size, left is not None) if head_path.exists() else None
-    named = (schema.robot, schema.stereo, schema.joints, schema.right, schema.left, schema.frame_times)
+    named = (schema.robot, *schema.stereo_files, schema.joints, schema.right, schema.left, schema.frame_times)
     inputs = (folder, *(folder / name for name in named if name is not None and (folder / name).exists()))
     return RecordingDescription(
         folder, robot, stereo, right, left, joints, frame_times_s, schema.laparoscope_arm, schema.instrument_arm,
@@ -105,13 +106,28 @@ def _load_robot(schema: RecordingSchema, folder: Path, note: Note) -> Robot:
     return robot
 
 
+def _read_cameras(schema: RecordingSchema, folder: Path, note: Note) -> StereoFile:
+    """What `stereo` names, of whichever program."""
+    if isinstance(schema.stereo, CameraPairSchema):
+        return read_camera_pair(folder / schema.stereo.right, folder / schema.stereo.left, note)
+
+    def picture_size() -> tuple[int, int]:
+        if schema.crop_right is not None or schema.crop_left is not None:
+            expected = f"an image size in {schema.stereo}, since the pictures are crops"
+            raise RecordingError(where=f"{folder / DESCRIPTION}: crop_right", expected=expected, found="none")
+        whole = open_reader(folder / schema.right)
+        return (
+            whole.size if schema.stereo_layout is None else EyeReader(whole, "right", schema.stereo_layout, False).size
+        )
+
+    return read_stereo(folder / schema.stereo, note, picture_size)
+
+
 def _cameras(schema: RecordingSchema, stereo: StereoFile, where: Path) -> StereoFile:
     """The cameras that the recording has pictures of, cut to the part that these show."""
     if schema.is_stereo != (stereo.left is not None):
-        has_pictures = stereo.left is None
-        expected = (
-            f"a left camera in {schema.stereo}" if has_pictures else f"left, for the left camera in {schema.stereo}"
-        )
+        has_pictures, files = stereo.left is None, " and ".join(schema.stereo_files)
+        expected = f"a left camera in {files}" if has_pictures else f"left, for the left camera in {files}"
         found = f"none for {schema.left or schema.stereo_layout}" if has_pictures else "no left video"
         raise RecordingError(where=f"{where}: left", expected=expected, found=found)
     right = stereo.right.cropped(schema.crop_right, f"{where}: crop_right")
@@ -152,11 +168,13 @@ def _check_size(reader: Reader, camera: Intrinsics, schema: RecordingSchema, sid
         found += (
             f": the same shape at {found_width / width:g} times the size. If the pictures are resized ones, write "
             f"image_size: [{found_width}, {found_height}] and, for {side}, fx: {new.fx:.6g}, fy: {new.fy:.6g}, "
-            f"cx: {new.cx:.6g}, cy: {new.cy:.6g} in {schema.stereo}"
+            f"cx: {new.cx:.6g}, cy: {new.cy:.6g} in {schema.stereo_files[0]}"
         )
     elif found_width <= width and found_height <= height:
         found += f": a part of it? then write crop_{side}: [u, v, {found_width}, {found_height}] in recording.yaml"
-    raise VideoError(where=str(reader.path), expected=f"frames of {width} x {height} px as in stereo.yaml", found=found)
+    raise VideoError(
+        where=str(reader.path), expected=f"frames of {width} x {height} px as in {schema.stereo_files[0]}", found=found
+    )
 
 
 def _frame_times(

@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float
 from rmis_calib.geometry.cameras import Camera, StereoRig
 from rmis_calib.geometry.rigid import RigidTransform
 from rmis_calib.io.description import RecordingDescription, read_description
+from rmis_calib.io.intrinsics import Intrinsics, StereoFile
 from rmis_calib.io.joints import JointLog
-from rmis_calib.io.stereo import Intrinsics, StereoFile
 from rmis_calib.io.tables import HeadPoints
 from rmis_calib.io.video import FrameSource
 from rmis_calib.robot import Robot
@@ -77,13 +77,14 @@ def load_recording(path: str | Path | RecordingDescription, clock_offset_s: floa
     """
     read = path if isinstance(path, RecordingDescription) else read_description(path, clock_offset_s)
     return Recording(
-        read.path, read.robot, _rig(read.stereo), FrameSource(read.right),
+        read.path, read.robot, camera_rig(read.stereo), FrameSource(read.right),
         None if read.left is None else FrameSource(read.left), read.joints, read.frame_times_s, read.laparoscope_arm,
         read.instrument_arm, read.shaft_diameter_mm, read.clock_offset_s, read.head_points, read.notes,
     )  # fmt: skip
 
 
-def _rig(stereo: StereoFile) -> StereoRig:
+def camera_rig(stereo: StereoFile) -> StereoRig:
+    """The cameras of a file as tensors, float64."""
     if stereo.left is None or stereo.camera_left_T_camera_right is None:
         return StereoRig(_camera(stereo.right))
     matrix = torch.from_numpy(stereo.camera_left_T_camera_right)
@@ -93,4 +94,5 @@ def _rig(stereo: StereoFile) -> StereoRig:
 
 def _camera(values: Intrinsics) -> Camera:
     distortion = list(values.distortion)
-    return Camera.from_values(values.fx, values.fy, values.cx, values.cy, distortion, image_size=values.image_size)
+    numbers = (values.fx, values.fy, values.cx, values.cy)
+    return Camera.from_values(*numbers, distortion, image_size=values.image_size, model=values.model)

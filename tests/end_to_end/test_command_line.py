@@ -35,10 +35,10 @@ def test_help_lists_the_commands(argv, capsys) -> None:
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))
 def test_help_of_every_command(name, capsys) -> None:
-    assert main(["help", name]) == 0
+    assert main(["help", *name.split()]) == 0
     shown = capsys.readouterr().out
     assert f"usage: rmis-calib {name}" in shown
-    assert main([name, "--help"]) == 0
+    assert main([*name.split(), "--help"]) == 0
     assert capsys.readouterr().out == shown
 
 

@@ -187,7 +187,7 @@ CASES: dict[str, Case] = {
     "four distortions": (
         edit("stereo.yaml", right__distortion=[0.0] * 4),
         RecordingError,
-        r"right\.distortion: expected 5 entries or more",
+        r"right: expected 5 entries of distortion for plumb_bob, found 4 \(distortion_model: equidistant\?\)",
     ),
     "unknown camera key": (edit("stereo.yaml", right__skew=0.0), RecordingError, r"right\.skew: .*unknown"),
     "fractional size": (

@@ -236,3 +236,34 @@ def test_the_real_recording(shared_data: Path) -> None:
     rank = shaft.int().argmax(1)
     rows = torch.arange(len(files))
     assert int((found.end_valid[rows, rank] & shaft.any(1)).sum()) >= 10
+
+
+FISHEYE = Camera.from_values(
+    560.0, 565.0, 322.0, 238.0, [0.06, -0.04, 0.02, -0.006], image_size=(480, 640), model="equidistant"
+)
+RATIONAL = Camera.from_values(
+    560.0, 565.0, 322.0, 238.0, [0.41, -0.12, 1e-3, -8e-4, 0.05, 0.72, 0.09, 0.11], image_size=(480, 640),
+    model="rational_polynomial",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("camera", [FISHEYE, RATIONAL], ids=["fisheye", "rational"])
+def test_contours_through_a_bent_lens_are_straight_and_in_place(camera: Camera) -> None:
+    bar = draw_bar(205.0, width_px=60.0, noise_levels=0.0)
+    K = np.array([[560.0, 0, 322.0], [0, 565.0, 238.0], [0, 0, 1]])
+    v, u = np.mgrid[:480, :640].astype(np.float64)
+    raw = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
+    undistort = (
+        cv2.fisheye.undistortPoints if camera is FISHEYE else getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
+    )
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+    # OpenCV finds where each raw pixel comes from in the straight picture: the truth is the drawn bar itself.
+    straight = undistort(raw, K, camera.distortion.numpy(), R=None, P=K, criteria=criteria).reshape(480, 640, 2)
+    bent = cv2.remap(bar.image, *np.moveaxis(straight.astype(np.float32), -1, 0), cv2.INTER_CUBIC)
+    found = ShaftDetector(camera=camera).detect(torch.from_numpy(bent).permute(2, 0, 1)[None])
+    assert bool(found.valid[0, 0])
+    # Contour points are normalised; back to the straight picture's pixels.
+    points = found.contour_xy[0, 0].double().numpy() * [560.0, 565.0] + [322.0, 238.0] - bar.centre
+    error = np.stack([points[0] @ bar.left - bar.width_px / 2, -points[1] @ bar.left - bar.width_px / 2])
+    # The lens moves these contours by several pixels; what remains is the interpolation's.
+    assert np.abs(error).max() < 0.15

@@ -24,7 +24,7 @@ class Lens:
     @cached_property
     def distorts(self) -> bool:
         """Whether raw and ideal pixels differ."""
-        return self.camera is not None and bool(torch.any(self.camera.distortion != 0))
+        return self.camera is not None and self.camera.distorts
 
     @property
     def focal_px(self) -> float:
