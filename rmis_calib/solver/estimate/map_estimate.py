@@ -107,7 +107,7 @@ def map_estimate(problem: Problem, settings: SolverSettings, start: "MapEstimate
     model = WeightedModel(measured, layout, noise, chunk=settings.chunk)
     state = fresh if start is not None else state
     _check_rows(measured)
-    state, noise = settle_noise(model, state, order, contaminated, assumed, free, settings)
+    state, noise = settle_noise(model, state, order, contaminated, assumed, free, settings, start is None)
     model = replace(model, noise=noise)
     refined, weight = _refine_all(model, state, contaminated | (settings.robust == "on"), settings)
     return _finish(problem, replace(model, weight=weight), refined, settings)

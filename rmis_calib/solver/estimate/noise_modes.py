@@ -42,6 +42,7 @@ def settle_noise(
     assumed: NoiseModel,
     free: dict[str, Tensor],
     settings: SolverSettings,
+    compete: bool = True,
 ) -> tuple[State, NoiseModel]:
     """State and noise levels, estimated on a sample without its outliers.
 
@@ -52,13 +53,14 @@ def settle_noise(
         contaminated: trials with outliers.
         assumed: levels that are given, and about which the others have their priors.
         free: which components are estimated.
+        compete: whether rivals are tried; not where the levels to set out from won before.
     """
     sample = model.take_motions(order[:SAMPLE_MOTIONS]) if model.measured.motions > SAMPLE_MOTIONS else model
     if not any_free(free):
         return _anneal(sample, state, contaminated, settings), sample.noise
     settled, noise = _settle(sample, state, contaminated, assumed, free, settings)
     at = torch.nonzero(_unusual(sample, noise, assumed, free, settings))[:, 0]
-    if not len(at):
+    if not compete or not len(at):
         return settled, noise
     part, start, mixed = sample.take_trials(at), state.take(at), contaminated[at]
     own, own_free = assumed.take(at), {name: value[at] for name, value in free.items()}
