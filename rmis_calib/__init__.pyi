@@ -7,6 +7,8 @@ from .config import load_config as load_config
 from .errors import CalibrationFailed as CalibrationFailed
 from .errors import InputError as InputError
 from .errors import RmisCalibError as RmisCalibError
+from .exports import ExportSettings as ExportSettings
+from .exports import export as export
 from .geometry import RigidTransform as RigidTransform
 from .geometry import residuals as residuals
 from .io import Recording as Recording

@@ -9,7 +9,7 @@ import platform
 from collections import Counter
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from importlib import metadata
+from importlib import import_module, metadata
 from pathlib import Path
 from typing import Any, Literal
 
@@ -253,6 +253,15 @@ class CalibrationResult:
             OutputError: another file is there, or it cannot be written.
         """
         write_json(Path(path), self.to_dict())
+
+    def export(self, to: str, out: str | Path, **options: Any) -> Path:
+        """Write the result as another program reads it: `rc.export` with its `options` (recording, settings, ...).
+
+        Raises:
+            CalibrationFailed, InputError, OutputError: as `rc.export`.
+        """
+        # By name: what results are made into lies above them, and they know nothing of it.
+        return import_module("rmis_calib.exports").export(self, to, out, **options)
 
     @classmethod
     def read(cls, path: str | Path) -> "CalibrationResult":

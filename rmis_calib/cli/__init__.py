@@ -20,6 +20,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "batch": ("Batch", "calibrate, or detect in, all recordings of a tree; resumes where it stopped"),
     "compare": ("Compare", "pool results of one set-up, test whether they agree, name what does not fit"),
     "solve": ("Solve", "estimate camera_right_T_arm from an observations file (.npz)"),
+    "export": ("Export", "write a result as another program reads it: dVRK, ROS, MoveIt, OpenCV, URDF and more"),
     "evaluate": ("Evaluate", "measure a result against head points and against a truth file"),
     "cameras show": ("CamerasShow", "print a camera file of any known format as stereo.yaml, and draw it"),
 }

@@ -24,6 +24,7 @@ from rmis_calib.cli.paths import beside, check_output_folder, setting_inputs
 from rmis_calib.cli.usage import parse_arguments
 from rmis_calib.config import CalibrationConfig, load_config
 from rmis_calib.errors import InputError, OutputError
+from rmis_calib.exports.settings import ExportSettings, FormatName
 from rmis_calib.io.configs import check_regular
 from rmis_calib.io.folders import DESCRIPTION, recording_folder
 from rmis_calib.io.outputs import (
@@ -249,6 +250,47 @@ class Evaluate:
         print_table("evaluation", evaluation.rows())
         if self.out is not None:
             write_json(self.out, {"format": EVALUATION_FORMAT} | finite_or_none(evaluation.to_dict()))
+        return EXIT_OK
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export:
+    """Write a result as another program reads it; docs/export.md has what each format holds.
+
+    Exit code 1, and nothing written, where the result is not trustworthy; --force writes it all the same, marked.
+    """
+
+    result: tyro.conf.Positional[Path]
+    """Result file (result.json), or a folder that holds one."""
+    to: FormatName
+    """Format. dvrk, ros-static-tf and surgsync are folders, the others files."""
+    out: Path
+    """File or folder to write."""
+    recording: Path | None = None
+    """Recording folder of the result: dvrk and surgsync need its arms, joints and cameras."""
+    overwrite: bool = False
+    """Replace OUT, if this program wrote it."""
+    force: bool = False
+    """Write a result that is not trustworthy, marked as such."""
+    settings: Annotated[ExportSettings, tyro.conf.arg(name="")] = field(default_factory=ExportSettings)
+
+    def run(self) -> int:
+        path = self.result / "result.json" if self.result.is_dir() else self.result
+        check_regular(path)
+        if self.recording is not None:
+            recording_folder(self.recording)
+        from rmis_calib.exports import export
+
+        export(
+            path,
+            self.to,
+            self.out,
+            recording=self.recording,
+            settings=self.settings,
+            overwrite=self.overwrite,
+            force=self.force,
+        )
+        say(f"written: {self.out} ({self.to})")
         return EXIT_OK
 
 
