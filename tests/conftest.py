@@ -5,7 +5,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from shape_checks import check_calls_into
 
+check_calls_into("rmis_calib")  # before any test imports it
 # Threads that wait by spinning take the cores from the tests, and the programs, that run beside them.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
