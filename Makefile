@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test lint bench clean
+.PHONY: demo test lint bench docs clean
 .DEFAULT_GOAL := demo
 
 $(STAMP): pyproject.toml
@@ -16,7 +16,7 @@ $(STAMP): pyproject.toml
 demo: $(STAMP)  ## render a stereo recording, calibrate it, leave demo_output/report.html
 	$(BIN)/rmis-calib demo --out demo_output --overwrite
 
-test: $(STAMP)  ## every test, the import contracts and the README's blocks
+test: $(STAMP)  ## every test, the import contracts and the documentation's Python
 	$(BIN)/python -m pytest -q -n auto --dist loadfile
 
 lint: $(STAMP)  ## ruff and pyright
@@ -24,8 +24,12 @@ lint: $(STAMP)  ## ruff and pyright
 	$(BIN)/ruff check .
 	$(BIN)/pyright
 
-bench: $(STAMP)  ## every table that the README quotes (long)
+bench: $(STAMP)  ## every table that the documentation quotes (long)
 	set -e; for f in tests/benchmarks/bench_*.py; do echo "== $$f"; $(BIN)/python $$f; done
+
+docs: $(STAMP)  ## the documentation as a site that opens from disk: build/site/index.html
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 clean:
 	rm -rf $(VENV) demo_output build dist .pytest_cache .ruff_cache .hypothesis
