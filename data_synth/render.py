@@ -244,6 +244,7 @@ def render_frames(
         count: number of frames instead of `config.motions`.
         side: "right" or "left".
         device: torch device that draws; the pictures stay there.
+
     Returns:
         pictures (N, 3, H, W) uint8 RGB, as the camera gives them (without H.264), and the truth of all N frames.
     """

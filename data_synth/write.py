@@ -47,8 +47,10 @@ def write_recording(
         device: torch device that draws.
         overwrite: replace a folder that is already there, if all of it was written by this function.
         on_progress: called with (frames done, frames in all), a stereo pair counting once.
+
     Returns:
         the folder.
+
     Raises:
         FileExistsError: something is there and `overwrite` is False, or this function did not write all of it.
     """

@@ -17,5 +17,5 @@ def on_page_markdown(markdown: str, page, **_) -> str:
 
 def _help(name: str) -> str:
     command = [sys.executable, "-m", "rmis_calib", *name.split(), "--help"]
-    environment = os.environ | {"COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
+    environment = os.environ | {"COLUMNS": "82", "NO_COLOR": "1", "TERM": "dumb"}
     return subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout.strip()

@@ -73,8 +73,10 @@ def export(
         settings: names of frames, camera, axes.
         overwrite: replace `out`, if this program wrote it.
         force: write a result that is not trustworthy, marked as such.
+
     Returns:
         `out`.
+
     Raises:
         CalibrationFailed: the result is not trustworthy (without `force`), or holds no transform.
         InputError: no such format, or something that the format needs is missing.

@@ -53,6 +53,7 @@ def rigid_exp(xi: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
     """The transform [[exp(rotvec), translation], [0, 1]] of the noise model.
 
     Convention: the translation enters directly. This is not the exponential of SE(3), which would rotate it as it goes.
+
     Args:
         xi: rotation vector in rad, then translation in mm.
     Source: DESIGN.md, section 3, "(exp(c deg eps), c mm eps)".

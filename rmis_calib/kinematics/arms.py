@@ -46,6 +46,7 @@ class RobotKinematics:
         instrument_arm: its name in the description.
         dtype: of all tensors; readings must have it too.
         device: of all tensors.
+
     Raises:
         RobotError: an arm, a frame number or a head point is missing or impossible, or the shaft misses the RCM.
     """
@@ -79,6 +80,7 @@ class RobotKinematics:
 
         Args:
             joints: readings of `laparoscope_joints`, rad or mm; (..., 0) where there is no arm.
+
         Raises:
             ShapeError: another number of joints, or another dtype.
         """
@@ -95,6 +97,7 @@ class RobotKinematics:
 
         Args:
             joints: readings of `instrument_joints`, rad or mm.
+
         Raises:
             ShapeError: another number of joints, or another dtype.
         """

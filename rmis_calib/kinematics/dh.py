@@ -29,6 +29,7 @@ def dh_matrix(
         theta: angle about z, rad.
         d: length along z, mm.
         convention: "modified" (Craig): Rx(alpha) Tx(a) Rz(theta) Tz(d); "standard": Rz(theta) Tz(d) Tx(a) Rx(alpha).
+
     Raises:
         RobotError: another convention.
     Source: Craig, Introduction to Robotics, Eq. 3.6 (modified); Spong, Robot Modeling and Control, Eq. 3.10 (standard).
@@ -60,6 +61,7 @@ def build_chain(
         convention: "modified" or "standard".
         dtype: of the chain; readings must have it too.
         device: of the chain.
+
     Raises:
         RobotError: no joints, an unknown joint type or an unknown convention.
     """
@@ -94,6 +96,7 @@ def frame_poses(chain: Chain, joints: Float[Tensor, "*batch j"]) -> Float[Tensor
     Args:
         chain: of J joints.
         joints: readings plus offsets, rad or mm, in the order of the table.
+
     Raises:
         ShapeError: not J values, or not the dtype of the chain.
     """

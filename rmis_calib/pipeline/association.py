@@ -97,6 +97,7 @@ def first_choices(
         detections: of the motions, one entry a camera.
         instruments: from `choices_by_instrument`.
         prior: from `read_prior`.
+
     Raises:
         InputError: there is no shaft where `config.instrument_at` points, or not enough of it to tell which one it is.
     """

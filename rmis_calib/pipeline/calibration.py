@@ -46,6 +46,7 @@ def calibrate(
         progress: called with (stage, done, total).
         throw: raise when the result is not trustworthy; otherwise its `status` and `message` say so.
         segment: maps pictures (b, 3, h, w) in [0, 1] to masks of shafts, in place of `config.masks`.
+
     Raises:
         CalibrationFailed: no trustworthy result (with `throw`); its `result` holds what there is.
         InputError, FileError: the recording breaks its format.

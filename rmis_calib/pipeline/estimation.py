@@ -62,6 +62,7 @@ def solve(
         differentiable: return the solver's tensors, of which `camera_right_T_arm` and `covariance` pass gradients to
             the tensors of the observations (`solver.solve` says what they include). Joint and clock offsets are then
             not estimated, and nothing is raised for trials without a trustworthy answer: `status` and `verdict` say so.
+
     Raises:
         CalibrationFailed: no trustworthy result (with `throw`); its `result` holds what there is.
         InsufficientDataError: too few motions.

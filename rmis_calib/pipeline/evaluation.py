@@ -93,6 +93,7 @@ def evaluate(
         result: what is measured.
         recording: the recording, or its folder.
         truth: a file as `read_reference` takes it; default: the recording's ground_truth.yaml, if any.
+
     Raises:
         InputError: the result has no transform, or a file breaks its format.
     """

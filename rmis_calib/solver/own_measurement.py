@@ -38,6 +38,7 @@ class Measurement:
         sigma: noise of each component of the residual, 1 sigma, in its unit: a number, or (*batch, N).
         camera: whose transform the residual is given.
         unit: of the residual, as reports show it.
+
     Raises:
         InputError: no values, an unknown camera, a sigma that is not positive, or a name that is taken.
     """
