@@ -69,9 +69,11 @@ class Arm:
     rcm_frame: int | None = None
     """Number of the frame whose origin is the RCM; instruments only."""
     shaft_frame: int | None = None
-    """Number of the frame whose z axis is the shaft, towards the tip; instruments only."""
+    """Number of the frame whose z axis is the shaft, towards the tip unless `shaft_reversed`; instruments only."""
     head_point: HeadPoint | None = None
     """Instruments only."""
+    shaft_reversed: bool = False
+    """The z axis of the shaft's frame points from the tip to the RCM, as in the Raven II's table."""
 
     @property
     def is_instrument(self) -> bool:

@@ -23,6 +23,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "export": ("Export", "write a result as another program reads it: dVRK, ROS, MoveIt, OpenCV, URDF and more"),
     "evaluate": ("Evaluate", "measure a result against head points and against a truth file"),
     "cameras show": ("CamerasShow", "print a camera file of any known format as stereo.yaml, and draw it"),
+    "robots list": ("RobotsList", "list the shipped robots"),
+    "robots show": ("RobotsShow", "print a robot as robot.yaml"),
+    "robots check": ("RobotsCheck", "test a robot: RCM fixed, limits, reach; and draw it"),
+    "robots import": ("RobotsImport", "make robot.yaml of a dVRK arm, tool and system, or of a URDF"),
 }
 """Class in cli/commands.py and what it does, by name; a name of two words is one of a group."""
 

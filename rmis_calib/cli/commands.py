@@ -20,6 +20,10 @@ from rmis_calib.cli.batch_console import (
 )
 from rmis_calib.cli.console import ProgressCallback, conclude, print_table, progress_reporter, say
 from rmis_calib.cli.equipment import CamerasShow as CamerasShow
+from rmis_calib.cli.equipment import RobotsCheck as RobotsCheck
+from rmis_calib.cli.equipment import RobotsImport as RobotsImport
+from rmis_calib.cli.equipment import RobotsList as RobotsList
+from rmis_calib.cli.equipment import RobotsShow as RobotsShow
 from rmis_calib.cli.paths import beside, check_output_folder, setting_inputs
 from rmis_calib.cli.usage import parse_arguments
 from rmis_calib.config import CalibrationConfig, load_config

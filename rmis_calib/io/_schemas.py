@@ -179,6 +179,7 @@ class ArmSchema(Schema):
     rcm_frame: Annotated[int, Field(ge=0)] | None = None
     shaft_frame: Annotated[int, Field(ge=0)] | None = None
     head_point: HeadPointSchema | None = None
+    shaft_reversed: bool = False
 
     @model_validator(mode="after")
     def _sane(self) -> "ArmSchema":

@@ -31,6 +31,30 @@ def load_robot(name_or_path: str | Path, note: Note = no_note) -> Robot:
     return Robot(schema.name, schema.dh_convention, arms)
 
 
+def robot_to_dict(robot: Robot) -> dict:
+    """As robot.yaml writes it: `load_robot` of it gives the same numbers."""
+    return {
+        "name": robot.name,
+        "dh_convention": robot.dh_convention,
+        "arms": {name: _arm_to_dict(arm) for name, arm in robot.arms.items()},
+    }
+
+
+def _arm_to_dict(arm: Arm) -> dict:
+    content: dict = {"base_T_arm_base": np.asarray(arm.base_T_arm_base).tolist(), "joints": []}
+    for joint in arm.joints:
+        row = {key: getattr(joint, key) for key in ("name", "type", "alpha_rad", "a_mm", "theta_rad", "d_mm", "offset")}
+        limits = {} if joint.min is None else {"min": joint.min, "max": joint.max}
+        content["joints"].append(row | limits)
+    if not np.array_equal(arm.end_T_tool, np.eye(4)):
+        content["end_T_tool"] = np.asarray(arm.end_T_tool).tolist()
+    if arm.head_point is not None:
+        content |= {"rcm_frame": arm.rcm_frame, "shaft_frame": arm.shaft_frame}
+        content |= {"shaft_reversed": True} if arm.shaft_reversed else {}
+        content["head_point"] = {"frame": arm.head_point.frame, "xyz_mm": list(arm.head_point.xyz_mm)}
+    return content
+
+
 def _arm(schema: ArmSchema, where: str, note: Note) -> Arm:
     base_T_arm_base = rigid_from_text(schema.base_T_arm_base, f"{where}.base_T_arm_base", RobotError, note)
     end_T_tool = np.eye(4)
@@ -43,6 +67,7 @@ def _arm(schema: ArmSchema, where: str, note: Note) -> Arm:
         schema.rcm_frame,
         schema.shaft_frame,
         _head_point(schema.head_point),
+        schema.shaft_reversed,
     )
 
 

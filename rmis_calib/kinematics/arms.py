@@ -71,6 +71,7 @@ class RobotKinematics:
         self._shaft_frame = _frame_number(table.shaft_frame, table, f"{where}, shaft_frame")
         if table.head_point is None:
             raise RobotError(where=where, expected="a head_point", found="none")
+        self._towards_tip = -1.0 if table.shaft_reversed else 1.0
         self._head_frame = _frame_number(table.head_point.frame, table, f"{where}, head_point.frame")
         self._head_p_point = torch.tensor(list(table.head_point.xyz_mm), dtype=dtype, device=device)
         self._check_shaft_meets_rcm(where)
@@ -109,7 +110,7 @@ class RobotKinematics:
         base_T_rcm = both[0, ..., self._rcm_frame, :, :]
         rcm_T_base = rigid_inverse(base_T_rcm)
         rcm_T_shaft = rcm_T_base @ both[0, ..., self._shaft_frame, :, :]
-        rcm_v_axis = rcm_T_shaft[..., :3, 2]
+        rcm_v_axis = self._towards_tip * rcm_T_shaft[..., :3, 2]
         base_T_head = both[..., self._head_frame, :, :]
         rcm_p_head, rcm_p_straight = transform_points(rcm_T_base @ base_T_head, self._head_p_point).unbind(0)
         return InstrumentPose(base_T_rcm, rcm_v_axis, rcm_p_head, (rcm_v_axis * rcm_p_straight).sum(-1))

@@ -1,6 +1,7 @@
 from .detection_pictures import DetectionPictures as DetectionPictures
 from .detection_pictures import PictureChoice as PictureChoice
 from .equipment import draw_cameras as draw_cameras
+from .equipment import draw_robot as draw_robot
 from .folder import calibrate_to_folder as calibrate_to_folder
 from .folder import write_calibration_folder as write_calibration_folder
 from .folder import write_lines as write_lines

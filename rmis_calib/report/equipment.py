@@ -1,5 +1,6 @@
-"""Drawings of cameras: what each sees, and how they lie to each other."""
+"""Drawings of cameras (what each sees, and how they lie to each other) and of robots (where the arms reach)."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from matplotlib.figure import Figure
 
 from rmis_calib.geometry.cameras import Camera, StereoRig
 from rmis_calib.io.atomic import atomic_write
+from rmis_calib.kinematics.robot_check import ArmReport
 
 _COLOURS = {"right": "#1f6fb4", "left": "#c05a12"}
 _DEPTH_BASELINES, _DEPTH_MONO_MM = 8.0, 100.0
@@ -44,6 +46,35 @@ def draw_cameras(rig: StereoRig, path: Path) -> None:
         if across == 1:
             axes.invert_yaxis()  # y points down
     figure.axes[0].legend(loc="upper left")
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, dpi=120, format="png")
+
+
+def draw_robot(arms: Sequence[ArmReport], path: Path) -> None:
+    """Every arm in some poses, in `base` and from three sides: shafts from RCM to head point, or the frames' origins.
+
+    Args:
+        arms: from `check_robot`.
+        path: picture to write (.png).
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    figure = Figure(figsize=(13.0, 4.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, (u, v) in zip(figure.subplots(1, 3), ((0, 1), (0, 2), (1, 2)), strict=True):
+        for number, arm in enumerate(arms):
+            for i, points in enumerate(arm.segments_mm):
+                label = arm.name if i == 0 else None
+                axes.plot(points[:, u], points[:, v], "-", color=f"C{number}", linewidth=1.0, label=label)
+                axes.plot(points[-1, u], points[-1, v], ".", color=f"C{number}")
+            if arm.is_instrument and len(arm.segments_mm):
+                axes.plot(
+                    arm.segments_mm[0, 0, u], arm.segments_mm[0, 0, v], "o", color=f"C{number}", markerfacecolor="none"
+                )
+        axes.set(xlabel=f"{'xyz'[u]} of base, mm", ylabel=f"{'xyz'[v]} of base, mm", aspect="equal")
+        axes.grid(alpha=0.3)
+    figure.axes[0].legend(loc="best")
     with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=120, format="png")
 
