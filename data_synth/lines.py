@@ -7,16 +7,18 @@ from typing import Any
 import numpy as np
 
 from data_synth.contours import contact_points, to_image, view_cylinder, visible_interval
-from data_synth.kinematics import Array, pose_noise, random_rotations, rigid, rigid_inverse, transform_points
+from data_synth.kinematics import Arm, Array, pose_noise, random_rotations, rigid, rigid_inverse, transform_points
 from data_synth.motion import joint_grid
-from data_synth.scene import Poses, Scene, build_scene, poses_at
+from data_synth.scene import MOVING_JOINTS, Poses, Scene, build_scene, poses_at
 from data_synth.settings import LineStudyConfig
 
 SHORTEST_VISIBLE_MM = 10.0
 """A shaft of which less is in the picture is not measured."""
 
 
-def simulate_lines(config: LineStudyConfig, readings: tuple[Array, Array] | None = None) -> dict[str, Any]:
+def simulate_lines(
+    config: LineStudyConfig, readings: tuple[Array, Array] | None = None, scene: Scene | None = None
+) -> dict[str, Any]:
     """Observations of `config.trials` independent trials in the keys of an observations file, each with a leading
     trials axis.
 
@@ -26,8 +28,9 @@ def simulate_lines(config: LineStudyConfig, readings: tuple[Array, Array] | None
 
     Args:
         config: scene, noise and number of trials.
-        readings: of the laparoscope's and of the instrument's joints, (N, 3) each, rad and mm; otherwise those of the
+        readings: of the laparoscope's and of the instrument's joints, (N, J) each, rad and mm; otherwise those of the
             configuration's motion.
+        scene: other arms than those of the configuration's scene (own_robot.py).
 
     Returns:
         arrays (trials, N, ...) and scalars, plus `truth`: camera_right_T_arm (trials, 4, 4), camera_left_T_camera_right
@@ -36,7 +39,7 @@ def simulate_lines(config: LineStudyConfig, readings: tuple[Array, Array] | None
         and not valid.
     """
     generator = np.random.default_rng(config.seed)
-    scene = build_scene(config.scene)
+    scene = build_scene(config.scene) if scene is None else scene
     poses = _true_poses(config, scene, generator) if readings is None else poses_at(scene, *readings)
     trials, n = config.trials, poses.rcm_v_axis.shape[-2]
     camera_right_T_arm = _hand_eye(config, scene, generator)[:, None]
@@ -83,10 +86,9 @@ def _sigmas(config: LineStudyConfig) -> dict[str, float]:
 
 def _true_poses(config: LineStudyConfig, scene: Scene, generator: np.random.Generator) -> Poses:
     """Poses of all motions, (N, ...) on a grid and (trials, N, ...) at random."""
-    half_range = 0.5 * np.array([np.deg2rad(config.rotation_range_deg)] * 2 + [config.translation_range_mm])
     if config.motion == "grid":
-        laparoscope = joint_grid(config.positions_laparoscope) * half_range
-        instrument = joint_grid(config.positions_instrument) * half_range
+        laparoscope = joint_grid(config.positions_laparoscope)
+        instrument = joint_grid(config.positions_instrument)
         laparoscope, instrument = (
             np.repeat(laparoscope, len(instrument), axis=0),
             np.tile(instrument, (len(laparoscope), 1)),
@@ -94,9 +96,21 @@ def _true_poses(config: LineStudyConfig, scene: Scene, generator: np.random.Gene
     else:
         shape = (config.trials, config.random_motions, 3)
         moving = float(config.positions_laparoscope > 1)
-        laparoscope = moving * generator.uniform(-1.0, 1.0, shape) * half_range
-        instrument = generator.uniform(-1.0, 1.0, shape) * half_range
-    return poses_at(scene, scene.laparoscope_home + laparoscope, scene.instrument_home + instrument)
+        laparoscope = moving * generator.uniform(-1.0, 1.0, shape)
+        instrument = generator.uniform(-1.0, 1.0, shape)
+    return poses_at(
+        scene,
+        _readings(config, scene.laparoscope, scene.laparoscope_home, laparoscope),
+        _readings(config, scene.instrument, scene.instrument_home, instrument),
+    )
+
+
+def _readings(config: LineStudyConfig, arm: Arm, home: Array, unit: Array) -> Array:
+    """Readings (..., J) of an arm whose moving joints are off home by `unit` (..., 3) of half their range."""
+    full = {"revolute": np.deg2rad(config.rotation_range_deg), "prismatic": config.translation_range_mm}
+    out = np.broadcast_to(home, (*unit.shape[:-1], len(home))).copy()
+    out[..., :MOVING_JOINTS] += unit * (0.5 * np.array([full[joint.kind] for joint in arm.joints[:MOVING_JOINTS]]))
+    return out
 
 
 def _hand_eye(config: LineStudyConfig, scene: Scene, generator: np.random.Generator) -> Array:

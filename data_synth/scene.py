@@ -15,6 +15,7 @@ import numpy as np
 from data_synth.kinematics import (
     Arm,
     Array,
+    Convention,
     Joint,
     arm_to_dict,
     rigid,
@@ -25,6 +26,11 @@ from data_synth.kinematics import (
 from data_synth.settings import SceneSettings
 
 HALF_PI = np.pi / 2.0
+CAMERA_T_END = rigid(rotation_from_rotvec([0.0, 0.0, 0.6]), [0.0, 0.0, -20.0])
+"""Last DH frame of the laparoscope's arm in the right camera: on the optical axis, 20 mm behind it, so that
+`end_T_tool` is not the identity."""
+MOVING_JOINTS = 3
+"""The first joints of an arm pivot about the RCM and insert; any after them (roll, wrist) stay at home."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +67,7 @@ def _rcm_joints(insertion_offset_mm: float) -> tuple[Joint, ...]:
     )
 
 
-def _frame_along(direction: Array, roll_rad: float) -> Array:
+def frame_along(direction: Array, roll_rad: float) -> Array:
     """Rotation whose z axis is `direction`, turned by `roll_rad` about it."""
     z = direction / np.linalg.norm(direction)
     helper = np.eye(3)[int(np.argmin(np.abs(z)))]
@@ -71,9 +77,9 @@ def _frame_along(direction: Array, roll_rad: float) -> Array:
     return frame @ rotation_from_rotvec([0.0, 0.0, roll_rad])
 
 
-def _place_arm(joints: tuple[Joint, ...], home: Array, base_T_end: Array) -> Array:
+def place_arm(joints: tuple[Joint, ...], home: Array, base_T_end: Array, convention: Convention = "modified") -> Array:
     """base_T_arm_base that puts the last frame at `base_T_end` when the readings are `home`."""
-    arm_base_T_end = Arm(np.eye(4), joints).frames(home)[-1]
+    arm_base_T_end = Arm(np.eye(4), joints, convention).frames(home)[-1]
     return base_T_end @ rigid_inverse(arm_base_T_end)
 
 
@@ -106,13 +112,11 @@ def build_scene(settings: SceneSettings) -> Scene:
 
 
 def _laparoscope(settings: SceneSettings, base_T_camera_home: Array, camera_T_arm: Array) -> tuple[Arm, Array]:
-    """The laparoscope's arm and its home readings. Its last DH frame is on the optical axis, 20 mm behind the camera,
-    so that `end_T_tool` is not the identity."""
-    camera_T_end = rigid(rotation_from_rotvec([0.0, 0.0, 0.6]), [0.0, 0.0, -20.0])
+    """The laparoscope's arm and its home readings."""
     joints = _rcm_joints(insertion_offset_mm=15.0)
     home = np.array([0.10, -0.15, settings.laparoscope_rcm_behind_mm - 20.0 - 15.0])
-    base_T_arm_base = _place_arm(joints, home, base_T_camera_home @ camera_T_end)
-    return Arm(base_T_arm_base, joints, end_T_tool=rigid_inverse(camera_T_end) @ camera_T_arm), home
+    base_T_arm_base = place_arm(joints, home, base_T_camera_home @ CAMERA_T_END)
+    return Arm(base_T_arm_base, joints, end_T_tool=rigid_inverse(CAMERA_T_END) @ camera_T_arm), home
 
 
 def _instrument(settings: SceneSettings, base_T_camera_home: Array) -> tuple[Arm, Array]:
@@ -121,11 +125,11 @@ def _instrument(settings: SceneSettings, base_T_camera_home: Array) -> tuple[Arm
     camera_p_rcm = np.asarray(settings.instrument_rcm_mm, dtype=np.float64)
     camera_v_axis = np.asarray(settings.target_mm, dtype=np.float64) - camera_p_rcm
     head_beyond_end_mm = 4.0
-    camera_T_head = rigid(_frame_along(camera_v_axis, roll_rad=-0.9), settings.target_mm)
+    camera_T_head = rigid(frame_along(camera_v_axis, roll_rad=-0.9), settings.target_mm)
     end_T_head = rigid(np.eye(3), [0.0, 0.0, head_beyond_end_mm])
     joints = _rcm_joints(insertion_offset_mm=-30.0)
     home = np.array([-0.20, 0.12, float(np.linalg.norm(camera_v_axis)) - head_beyond_end_mm + 30.0])
-    base_T_arm_base = _place_arm(joints, home, base_T_camera_home @ camera_T_head @ rigid_inverse(end_T_head))
+    base_T_arm_base = place_arm(joints, home, base_T_camera_home @ camera_T_head @ rigid_inverse(end_T_head))
     head = (0.0, 0.0, head_beyond_end_mm)
     return Arm(base_T_arm_base, joints, rcm_frame=0, shaft_frame=3, head_frame=3, head_xyz_mm=head), home
 

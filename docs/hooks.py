@@ -5,13 +5,15 @@ import subprocess
 import sys
 
 from rmis_calib.cli import COMMANDS
+from rmis_calib.cli.study_commands import STUDIES
 
 
 def on_page_markdown(markdown: str, page, **_) -> str:
     """The page with the help of every command in place of its marker."""
     if page.file.src_uri != "commands.md":
         return markdown
-    parts = [f"## {name}\n\n```text\n{_help(name)}\n```\n" for name in COMMANDS]
+    names = [*COMMANDS, *(f"study {name}" for name in STUDIES)]
+    parts = [f"## {name}\n\n```text\n{_help(name)}\n```\n" for name in names]
     return "\n".join(["# Commands\n", *parts])
 
 

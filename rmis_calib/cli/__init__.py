@@ -19,6 +19,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "calibrate": ("Calibrate", "estimate camera_right_T_arm from a recording folder"),
     "batch": ("Batch", "calibrate, or detect in, all recordings of a tree; resumes where it stopped"),
     "compare": ("Compare", "pool results of one set-up, test whether they agree, name what does not fit"),
+    "study": ("Study", "Monte-Carlo studies: the paper's experiments and your own robot (noise, motions, plan, ...)"),
     "solve": ("Solve", "estimate camera_right_T_arm from an observations file (.npz)"),
     "export": ("Export", "write a result as another program reads it: dVRK, ROS, MoveIt, OpenCV, URDF and more"),
     "evaluate": ("Evaluate", "measure a result against head points and against a truth file"),

@@ -12,7 +12,7 @@ from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bars
 
 from rmis_calib.cli import EXIT_NOT_TRUSTWORTHY, EXIT_OK
-from rmis_calib.cli.console import LOG_INTERVAL_S, console, print_table, say
+from rmis_calib.cli.console import LOG_INTERVAL_S, console, print_table, say, time_left
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -45,7 +45,7 @@ def batch_reporter() -> Iterator["Callable[[Progress], None]"]:
             if progress.record is not None:
                 bars.remove_task(rows.pop(event.index))
                 bars.console.print(_end_line(progress), markup=False, highlight=False, soft_wrap=True)
-            note = f"{progress.done_jobs} of {progress.jobs}, {_left(progress.left_s)}"
+            note = f"{progress.done_jobs} of {progress.jobs}, {time_left(progress.left_s)}"
             bars.update(whole, completed=progress.frames_done, total=progress.frames or None, note=note)
 
         yield report
@@ -60,7 +60,7 @@ def _line_reporter() -> "Callable[[Progress], None]":
             print(_end_line(progress), file=sys.stderr, flush=True)
         elif time.monotonic() - last >= LOG_INTERVAL_S and progress.event.kind == "progress":
             stage, done, total = progress.event.value
-            where = f"{progress.done_jobs} of {progress.jobs} recordings, {_left(progress.left_s)}"
+            where = f"{progress.done_jobs} of {progress.jobs} recordings, {time_left(progress.left_s)}"
             print(f"{where}; {progress.name}: {stage} {done}/{total}", file=sys.stderr, flush=True)
         else:
             return
@@ -73,20 +73,6 @@ def _end_line(progress: "Progress") -> str:
     record = progress.record
     assert record is not None
     return f"[{progress.done_jobs}/{progress.jobs}] {record.name} ({record.seconds:.1f} s): {record.line}"
-
-
-def _left(seconds: float | None) -> str:
-    if seconds is None:
-        return "time left not known yet"
-    hours, rest = divmod(round(seconds), 3600)
-    minutes, seconds = divmod(rest, 60)
-    return (
-        f"{hours} h {minutes} min left"
-        if hours
-        else f"{minutes} min {seconds} s left"
-        if minutes
-        else f"{seconds} s left"
-    )
 
 
 def _cut(name: str) -> str:

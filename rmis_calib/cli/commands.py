@@ -25,6 +25,7 @@ from rmis_calib.cli.equipment import RobotsImport as RobotsImport
 from rmis_calib.cli.equipment import RobotsList as RobotsList
 from rmis_calib.cli.equipment import RobotsShow as RobotsShow
 from rmis_calib.cli.paths import beside, check_output_folder, setting_inputs
+from rmis_calib.cli.study_commands import parse_study
 from rmis_calib.cli.usage import parse_arguments
 from rmis_calib.config import CalibrationConfig, load_config
 from rmis_calib.errors import InputError, OutputError
@@ -51,6 +52,8 @@ def parse(class_name: str, command: str, argv: Sequence[str]) -> Any:
         SystemExit: help was asked for, and printed.
         InputError: a word that is not understood, or a value that no setting may have.
     """
+    if command == "study":
+        return parse_study(argv)
     kind = globals()[class_name]
     config = _config_argument(argv)
     default = kind.defaults(load_config(config)) if config and issubclass(kind, _Estimates) else None

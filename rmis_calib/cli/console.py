@@ -64,6 +64,21 @@ def print_table(title: str, rows: list[tuple[str, str]]) -> None:
     console.print(table)
 
 
+def time_left(seconds: float | None) -> str:
+    """Seconds left, in words."""
+    if seconds is None:
+        return "time left not known yet"
+    hours, rest = divmod(round(seconds), 3600)
+    minutes, seconds = divmod(rest, 60)
+    return (
+        f"{hours} h {minutes} min left"
+        if hours
+        else f"{minutes} min {seconds} s left"
+        if minutes
+        else f"{seconds} s left"
+    )
+
+
 def print_advice(sentences: list[str]) -> None:
     """What would make the next recording better, one line a step; nothing where there is no advice."""
     if sentences:

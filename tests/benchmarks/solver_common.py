@@ -3,7 +3,7 @@ and errors."""
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -11,13 +11,12 @@ from torch import Tensor
 
 from data_synth.lines import simulate_lines
 from data_synth.settings import LineStudyConfig
-from rmis_calib.geometry.rotations import matrix_to_rotvec
 from rmis_calib.solver import Problem, SolverSettings
-from rmis_calib.solver.estimate.noise_levels import assumed_noise
-from rmis_calib.solver.model.measurement_rows import pack
-from rmis_calib.solver.model.normal_equations import WeightedModel, accumulate
-from rmis_calib.solver.model.parameters import NuisancePriors, initial_state, make_layout
 from rmis_calib.solver.settings import UnknownSettings
+from rmis_calib.studies.measures import cramer_rao_bound, rotation_deg, translation_mm
+from rmis_calib.studies.measures import transform_errors as errors
+
+__all__ = ["errors", "rotation_deg", "translation_mm"]
 
 KNOWN_RADIUS = UnknownSettings(radius_sigma_relative=0.0)
 """The simulation's radius is exact."""
@@ -75,30 +74,8 @@ def study(
     }
     clean = Problem.from_arrays(exact).only(*kinds).cameras(cameras)
     X = torch.as_tensor(truth["camera_right_T_arm"])
-    solver = SolverSettings(unknowns=unknowns)
-    measured = pack(clean, solver.noise)
-    state = replace(
-        initial_state(NuisancePriors.of(clean), X[:, :3, :3], X[:, :3, 3]),
-        end_offset=torch.full_like(X[:, 0, 0], truth["shaft_end_offset_mm"]),
-    )
-    layout = make_layout(NuisancePriors.of(clean), measured, state, unknowns, solver.noise)
-    noise, _ = assumed_noise(clean, solver.noise)
-    information = accumulate(WeightedModel(measured, layout, noise, chunk=solver.chunk), state).H
-    return Study(problem, X, torch.linalg.inv(information)[:, :6, :6])
-
-
-def errors(estimate: Tensor, truth: Tensor) -> Tensor:
-    """(dphi rad, dt mm) of R = exp(dphi) R_true, t = t_true + dt."""
-    turn = matrix_to_rotvec(estimate[..., :3, :3] @ truth[..., :3, :3].mT)
-    return torch.cat((turn, estimate[..., :3, 3] - truth[..., :3, 3]), dim=-1)
-
-
-def rotation_deg(e: Tensor) -> Tensor:
-    return torch.rad2deg(torch.linalg.vector_norm(e[..., :3], dim=-1))
-
-
-def translation_mm(e: Tensor) -> Tensor:
-    return torch.linalg.vector_norm(e[..., 3:], dim=-1)
+    bound = cramer_rao_bound(clean, X, truth["shaft_end_offset_mm"], SolverSettings(unknowns=unknowns))
+    return Study(problem, X, bound)
 
 
 def rms(x: Tensor) -> float:

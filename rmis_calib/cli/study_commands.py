@@ -1,0 +1,141 @@
+"""The studies: each a sub-command of `study`, with its settings as flags."""
+
+import re
+import shlex
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, TextColumn
+from rich.progress import Progress as Bars
+
+from rmis_calib.cli import EXIT_BAD_INPUT, EXIT_OK
+from rmis_calib.cli.console import LOG_INTERVAL_S, say, time_left
+from rmis_calib.cli.usage import parse_arguments
+from rmis_calib.errors import InputError
+from rmis_calib.io.configs import did_you_mean
+from rmis_calib.studies.settings import NoiseStudySettings
+
+if TYPE_CHECKING:
+    from rmis_calib.studies.engine import Progress
+    from rmis_calib.studies.output import StudyResult
+    from rmis_calib.studies.page import Table
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Study:
+    """What every study has."""
+
+    command: tyro.conf.Suppress[str | None] = None
+    """How the program was called, for the outputs."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Noise(_Study):
+    """Error against the noise coefficient, by method and number of cameras, with the Cramer-Rao bound (Fig. 2).
+
+    Writes OUT/index.html, noise.pdf, noise.png, trials.csv, trials.parquet and summary.csv. Started again in the same
+    folder, it goes on where it stopped.
+    """
+
+    out: Path = Path("study_noise")
+    """Folder to write, or to go on with."""
+    settings: tyro.conf.OmitArgPrefixes[NoiseStudySettings] = field(default_factory=NoiseStudySettings)
+
+    def run(self) -> int:
+        from rmis_calib.studies import study_noise
+
+        with study_reporter() as progress:
+            return conclude_study(study_noise(self.out, self.settings, progress=progress, command=self.command))
+
+
+STUDIES: dict[str, tuple[type, str]] = {
+    "noise": (Noise, "error against noise, by method and number of cameras (Fig. 2)"),
+}
+
+
+def parse_study(argv: Sequence[str]) -> Any:
+    """The study that the words after `study` ask for.
+
+    Raises:
+        SystemExit: help was asked for, and printed.
+        InputError: no such study, or a word that is not understood.
+    """
+    if not argv or argv[0] in ("-h", "--help"):
+        print(_overview())
+        raise SystemExit(EXIT_OK if argv else EXIT_BAD_INPUT)
+    name = argv[0]
+    if name not in STUDIES:
+        found = f"{name!r}{did_you_mean(name, list(STUDIES))}"
+        raise InputError(where="rmis-calib study", expected=f"one of {', '.join(STUDIES)}", found=found)
+    try:
+        parsed = parse_arguments(STUDIES[name][0], argv[1:], f"rmis-calib study {name}")
+        return replace(parsed, command=shlex.join(["rmis-calib", "study", *argv]))
+    except InputError as error:
+        where = re.sub(r"^--(run|setup)\.", "--", error.where)  # the flags have no groups in their names
+        raise InputError(where=where, expected=error.expected, found=error.found) from None
+
+
+def _overview() -> str:
+    lines = ["usage: rmis-calib study NAME [OPTIONS]     (rmis-calib study NAME --help for its options)", ""]
+    lines += [f"  {name:<13} {sentence}" for name, (_, sentence) in STUDIES.items()]
+    return "\n".join([*lines, "", "--quick: under a minute; without it, minutes to half an hour on two cores"])
+
+
+@contextmanager
+def study_reporter() -> Iterator[Callable[["Progress"], None]]:
+    """A callback for the progress of a study: a bar on a terminal, a line every few seconds elsewhere."""
+    if not sys.stderr.isatty():
+        yield _line_reporter()
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"))
+    with Bars(*columns, console=Console(stderr=True)) as bars:
+        whole = bars.add_task("cells", total=None, note="")
+
+        def report(progress: "Progress") -> None:
+            bars.update(whole, completed=progress.done, total=max(1, progress.total), note=_how_far(progress))
+
+        yield report
+
+
+def _line_reporter() -> Callable[["Progress"], None]:
+    last = 0.0
+
+    def report(progress: "Progress") -> None:
+        nonlocal last
+        if progress.done in (0, progress.total) or time.monotonic() - last >= LOG_INTERVAL_S:
+            last = time.monotonic()
+            print(_how_far(progress), file=sys.stderr, flush=True)
+
+    return report
+
+
+def _how_far(progress: "Progress") -> str:
+    stored = f" ({progress.stored} stored before)" if progress.stored else ""
+    left = "" if progress.done == progress.total else f", {time_left(progress.left_s)}"
+    return f"{progress.done} of {progress.total} cells{stored}{left}"
+
+
+def conclude_study(result: "StudyResult") -> int:
+    """What was found, and where it is."""
+    for table in result.tables:
+        _print_table(table)
+    for sentence in result.sentences:
+        say(sentence)
+    say(f"written: {result.page}")
+    return EXIT_OK
+
+
+def _print_table(table: "Table") -> None:
+    """Columns side by side, as wide as they need."""
+    say(table.title)
+    widths = [max(len(row[i]) for row in (table.headings, *table.rows)) for i in range(len(table.headings))]
+    for row in (table.headings, *table.rows):
+        say("  " + "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
+    say("")

@@ -1,0 +1,116 @@
+"""Settings of the studies. Importing this module imports neither torch nor anything heavy."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+_STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+Count = Annotated[int, Field(ge=1)]
+NotNegative = Annotated[float, Field(ge=0.0)]
+Positive = Annotated[float, Field(gt=0.0)]
+Vector = tuple[float, float, float]
+Cameras = Literal["mono", "stereo"]
+
+QUICK_TRIALS = 8
+FULL_TRIALS = 100
+
+
+@dataclass(frozen=True, config=_STRICT)
+class SetupSettings:
+    """The robot, the cameras and the place of the instrument that are simulated. Defaults: those of the built-in
+    scene."""
+
+    robot: str | None = None
+    """Your robot: a preset's name or robot.yaml. Its arms are placed so that the instrument is where the scene wants
+    it. Default: two arms of three joints."""
+    stereo: Path | None = None
+    """Your cameras: stereo.yaml. Focal length, picture size and extrinsics count; lines are taken as undistorted."""
+    laparoscope_arm: str = "laparoscope"
+    """Name of the laparoscope's arm in the robot."""
+    instrument_arm: str = "instrument"
+    """Name of the instrument's arm in the robot."""
+    rotation_range_deg: Positive = 10.0
+    """Full range of every revolute joint that moves."""
+    translation_range_mm: Positive = 20.0
+    """Full range of every insertion."""
+    laparoscope_rcm_behind_mm: Positive | None = None
+    """Distance of the laparoscope's remote centre of motion behind the camera, in the middle of the motion."""
+    instrument_rcm_mm: Vector | None = None
+    """The instrument's remote centre of motion, in the right camera's frame."""
+    target_mm: Vector | None = None
+    """The instrument's head point in the middle of the motion, in the right camera's frame: the working point, where
+    errors count."""
+    shaft_diameter_mm: Positive | None = None
+    """Diameter of the instrument's shaft."""
+    pixel_noise_px: NotNegative = 0.5
+    """Noise of every image point, 1 sigma per coordinate."""
+
+
+@dataclass(frozen=True, config=_STRICT)
+class RunSettings:
+    """How a study is run."""
+
+    trials: Count | None = None
+    """Trials of every condition. Default: 100, and 8 with --quick."""
+    seed: Annotated[int, Field(ge=0)] = 0
+    """Seed of everything random."""
+    quick: bool = False
+    """Fewer conditions and trials: under a minute on two cores."""
+    extensions: tuple[Path, ...] = ()
+    """Python files that add methods or noise sources of your own (docs/studies.md)."""
+    workers: Count | None = None
+    """Processes that work side by side. Default: one a core. 1 works in this process."""
+    cluster: str | None = None
+    """Address of a dask scheduler (tcp://host:8786), or `local` to start one here, in place of own processes. The
+    workers must see the output folder and the extensions under the same paths."""
+
+    @property
+    def n_trials(self) -> int:
+        return self.trials or (QUICK_TRIALS if self.quick else FULL_TRIALS)
+
+
+@dataclass(frozen=True, config=_STRICT)
+class NoiseStudySettings:
+    """Error against the noise coefficient (the paper's Fig. 2)."""
+
+    methods: tuple[str, ...] = ("paper", "global", "joint-axis", "joint-contours")
+    """Methods to compare."""
+    sources: tuple[str, ...] = ("kinematics", "kinematics-camera", "kinematics-camera-stereo")
+    """Noise sources, each a column of the figure."""
+    coefficients: tuple[NotNegative, ...] | None = None
+    """Noise coefficients: a coefficient c is c mm and c deg, 1 sigma per axis. Default: 0 to 2 by 0.2; with --quick
+    0, 1 and 2."""
+    cameras: tuple[Cameras, ...] = ("mono", "stereo")
+    """Cameras used."""
+    positions_laparoscope: Count = 3
+    """Positions a joint of the laparoscope, M_L."""
+    positions_instrument: Count = 4
+    """Positions a joint of the instrument, M_I: there are M_L^3 M_I^3 motions."""
+    setup: SetupSettings = SetupSettings()
+    """What is simulated."""
+    run: RunSettings = RunSettings()
+    """How it is run."""
+
+
+@dataclass(frozen=True, config=_STRICT)
+class MotionsStudySettings:
+    """Error against the number of motions, N = M_L^3 M_I^3 (the paper's Fig. 3)."""
+
+    methods: tuple[str, ...] = ("paper", "global", "joint-axis", "joint-contours")
+    """Methods to compare."""
+    source: str = "kinematics-camera-stereo"
+    """Noise source."""
+    coefficient: NotNegative = 1.0
+    """Noise coefficient: c mm and c deg, 1 sigma per axis."""
+    positions: tuple[Annotated[int, Field(ge=2)], ...] | None = None
+    """Products M_L M_I, of which all splits are simulated. Default: 3 to 12, which is 27 to 1,728 motions; with --quick
+    3, 4, 6 and 8."""
+    cameras: tuple[Cameras, ...] = ("mono", "stereo")
+    """Cameras used."""
+    setup: SetupSettings = SetupSettings()
+    """What is simulated."""
+    run: RunSettings = RunSettings()
+    """How it is run."""
