@@ -34,6 +34,7 @@ from .results import CalibrationResult as CalibrationResult
 from .solver.model.pose_refinement import Refinement as Refinement
 from .solver.model.pose_refinement import refine as refine
 from .solver.own_measurement import Measurement as Measurement
+from .studies import study_motions as study_motions
 from .studies import study_noise as study_noise
 from .vision import ShaftDetector as ShaftDetector
 

@@ -20,7 +20,7 @@ from rmis_calib.cli.console import LOG_INTERVAL_S, say, time_left
 from rmis_calib.cli.usage import parse_arguments
 from rmis_calib.errors import InputError
 from rmis_calib.io.configs import did_you_mean
-from rmis_calib.studies.settings import NoiseStudySettings
+from rmis_calib.studies.settings import MotionsStudySettings, NoiseStudySettings
 
 if TYPE_CHECKING:
     from rmis_calib.studies.engine import Progress
@@ -55,8 +55,28 @@ class Noise(_Study):
             return conclude_study(study_noise(self.out, self.settings, progress=progress, command=self.command))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Motions(_Study):
+    """Error against the number of motions, for every split over the two arms, by method and number of cameras (Fig. 3).
+
+    Writes OUT/index.html, motions_mono and motions_stereo (.pdf, .png), trials.csv, trials.parquet and summary.csv.
+    Started again in the same folder, it goes on where it stopped.
+    """
+
+    out: Path = Path("study_motions")
+    """Folder to write, or to go on with."""
+    settings: tyro.conf.OmitArgPrefixes[MotionsStudySettings] = field(default_factory=MotionsStudySettings)
+
+    def run(self) -> int:
+        from rmis_calib.studies import study_motions
+
+        with study_reporter() as progress:
+            return conclude_study(study_motions(self.out, self.settings, progress=progress, command=self.command))
+
+
 STUDIES: dict[str, tuple[type, str]] = {
     "noise": (Noise, "error against noise, by method and number of cameras (Fig. 2)"),
+    "motions": (Motions, "error against the number of motions, by which arm moves (Fig. 3)"),
 }
 
 

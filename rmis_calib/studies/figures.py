@@ -121,7 +121,9 @@ def _draw_method(axes: Axes, series: Series) -> None:
     bars = np.stack([middle - low, np.where(np.isfinite(high), high, middle) - middle])[:, shown]
     axes.errorbar(
         x[shown], middle[shown], yerr=bars, color=colour, marker=MARKERS[place], markersize=3.2,
-        linewidth=1.0 if series.style.has_line else 0.0, elinewidth=0.7, capsize=1.5, capthick=0.7, label=series.name,
+        linewidth=1.0 if series.style.has_line else 0.0, elinewidth=0.7, capsize=1.5, capthick=0.7,
+        label=series.name if series.style.has_line else None,  # hollow points are for the caption
+
         markerfacecolor=colour if series.style.has_line else "white", markeredgewidth=0.7,
     )  # fmt: skip
 

@@ -21,7 +21,7 @@ from rmis_calib.solver import Problem, solve
 from rmis_calib.studies import cells, measures
 from rmis_calib.studies.builtin import SETTINGS
 from rmis_calib.studies.registry import find_method
-from rmis_calib.studies.settings import NoiseStudySettings, RunSettings, SetupSettings
+from rmis_calib.studies.settings import MotionsStudySettings, NoiseStudySettings, RunSettings, SetupSettings
 from rmis_calib.studies.simulation import Condition, make_setup, simulate
 
 OWN = Path(__file__).with_name("own_things.py")
@@ -235,6 +235,21 @@ def test_the_command_leaves_everything_that_a_paper_needs(tmp_path, capsys) -> N
     assert "pointermove" in page
     assert "src=" not in page  # nothing is loaded
     assert "rmis_calib" in page
+
+
+def test_motions_are_split_over_the_arms_in_every_way(tmp_path) -> None:
+    run = RunSettings(trials=1, workers=1)
+    settings = MotionsStudySettings(methods=("joint-contours",), positions=(6, 3), cameras=("mono",), run=run)
+    result = rc.study_motions(tmp_path / "out", settings)
+    splits = [(r["laparoscope_positions"], r["instrument_positions"], r["motions"]) for r in result.summary]
+    assert splits == [(1, 3, 27), (3, 1, 27), (1, 6, 216), (2, 3, 216), (3, 2, 216), (6, 1, 216)]
+    assert [table.title.partition(":")[0] for table in result.tables] == [
+        "Both arms move", "Instrument alone", "Laparoscope alone"
+    ]  # fmt: skip
+    both = next(panel for panel in result.figures[0].rows[0] if panel.title == "both arms move")
+    lines = {series.name: series.x for series in both.series}
+    assert lines["joint, contours"] == (216.0,)  # a product that is prime has no such split
+    assert lines["joint, contours, other splits"] == (216.0,)
 
 
 def test_folders_of_others_are_left_alone(tmp_path) -> None:
