@@ -1,3 +1,4 @@
+from . import baselines as baselines
 from . import studies as studies
 from .batches import BatchSettings as BatchSettings
 from .batches import batch as batch

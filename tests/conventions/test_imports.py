@@ -65,6 +65,7 @@ def test_contracts_say_what_the_design_says() -> None:
         ["pipeline"],
         ["results"],
         ["config"],
+        ["baselines"],
         ["solver"],
         ["kinematics", "vision", "io"],
         ["geometry"],
