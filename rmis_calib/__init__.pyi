@@ -20,6 +20,9 @@ from .pipeline import (
     calibrate as calibrate,
 )
 from .pipeline import (
+    check as check,
+)
+from .pipeline import (
     detect as detect,
 )
 from .pipeline import (

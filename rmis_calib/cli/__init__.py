@@ -16,6 +16,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("Demo", "render a stereo recording, calibrate it, compare with the truth, leave a report"),
     "synth": ("Synth", "render a synthetic recording folder with its ground truth"),
     "detect": ("Detect", "find the instrument shaft in a recording, a video, a folder of images or an image"),
+    "check": ("Check", "look a recording over before it is calibrated: files, clocks, motion, a few pictures"),
     "calibrate": ("Calibrate", "estimate camera_right_T_arm from a recording folder"),
     "batch": ("Batch", "calibrate, or detect in, all recordings of a tree; resumes where it stopped"),
     "compare": ("Compare", "pool results of one set-up, test whether they agree, name what does not fit"),

@@ -18,7 +18,7 @@ from rmis_calib.cli.batch_console import (
     say_plan,
     stopped_by_signal,
 )
-from rmis_calib.cli.console import ProgressCallback, conclude, print_table, progress_reporter, say
+from rmis_calib.cli.console import ProgressCallback, conclude, conclude_check, print_table, progress_reporter, say
 from rmis_calib.cli.equipment import CamerasShow as CamerasShow
 from rmis_calib.cli.equipment import RobotsCheck as RobotsCheck
 from rmis_calib.cli.equipment import RobotsImport as RobotsImport
@@ -101,6 +101,26 @@ class _Estimates:
             FileError: masks or a prior that are not there.
         """
         return setting_inputs(self.config, self.settings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check(_Estimates):
+    """Look a recording over before it is calibrated, within seconds: files and units, clocks, motion of the joints,
+    repeated pictures, swapped cameras, and the accuracy to expect. Nothing is written.
+
+    Exit code 0: nothing speaks against calibrating it; 1: doubts that would make a calibration untrustworthy; 2: the
+    recording breaks its format.
+    """
+
+    recording: tyro.conf.Positional[Path]
+    """Recording folder."""
+
+    def run(self) -> int:
+        recording_folder(self.recording)
+        self.inputs()
+        from rmis_calib.pipeline import check
+
+        return conclude_check(check(self.recording, self.resolved()), self.recording)
 
 
 @dataclass(frozen=True, kw_only=True)

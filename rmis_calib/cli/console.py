@@ -14,6 +14,7 @@ from rich.table import Table
 from rmis_calib.cli import EXIT_NOT_TRUSTWORTHY, EXIT_OK
 
 if TYPE_CHECKING:
+    from rmis_calib.pipeline import RecordingCheck
     from rmis_calib.results import CalibrationResult
 
 ProgressCallback = Callable[[str, int, int], None]
@@ -104,6 +105,20 @@ def conclude(result: "CalibrationResult", written: Path) -> int:
         print_advice(result.observability.get("advice") or [])
     say(f"written: {written}\n")
     return EXIT_OK if result.trustworthy else EXIT_NOT_TRUSTWORTHY
+
+
+def conclude_check(check: "RecordingCheck", recording: Path) -> int:
+    """Print what was found in a recording, the exit code says whether there are any."""
+    rows = [
+        (finding.topic, f"DOUBT: {finding.sentence}" if finding.is_doubt else finding.sentence)
+        for finding in check.findings
+    ]
+    print_table(f"what can be said of {recording} before it is calibrated", rows)
+    for note in check.notes:
+        say(f"note: {note}")
+    count = len(check.doubts)
+    say("nothing speaks against calibrating it" if check.fit else f"{count} doubt{'s' if count > 1 else ''}: see above")
+    return EXIT_OK if check.fit else EXIT_NOT_TRUSTWORTHY
 
 
 def result_rows(result: "CalibrationResult") -> list[tuple[str, str]]:

@@ -4,4 +4,7 @@ from .detection import detect as detect
 from .estimation import solve as solve
 from .evaluation import Evaluation as Evaluation
 from .evaluation import evaluate as evaluate
+from .findings import Finding as Finding
+from .readiness import RecordingCheck as RecordingCheck
+from .readiness import check as check
 from .run import CalibrationRun as CalibrationRun

@@ -15,6 +15,7 @@ from rmis_calib.pipeline.detection import Progress, View, detect_recording, no_p
 from rmis_calib.pipeline.device import require_device
 from rmis_calib.pipeline.estimation import estimate, raise_unless_trustworthy
 from rmis_calib.pipeline.evaluation import head_point_errors, summarise_head_points
+from rmis_calib.pipeline.findings import about_motions, about_order
 from rmis_calib.pipeline.frozen import about_repeats, repeated_motions, without_frames
 from rmis_calib.pipeline.misfit import with_misfit_named
 from rmis_calib.pipeline.observations import assemble
@@ -73,8 +74,11 @@ def run_calibration(
     poses = motion_poses(recording, config.device)
     views, notes = _detect(recording, config, poses, progress, segment)
     attempts, several = associate(recording, config, poses, views, prior)
-    run = _solve_surest(recording, config, views, poses, attempts, progress)
-    run = _choose_again(run, _without_joint_offsets(config), several, progress)
+    checked = (*about_motions(recording, poses, config), *about_order(recording, poses, views, attempts[0]))
+    notes += tuple(f"{finding.topic}: {finding.sentence}" for finding in checked if finding.is_doubt)
+    draft = _without_joint_offsets(config)
+    run = solve_choices(recording, draft, views, poses, attempts, progress)
+    run = _choose_again(run, draft, several, progress)
     run = _with_joint_offsets(run, config, progress)
     progress("checking", 0, 1)
     run = with_misfit_named(run, config, lambda: _with_cameras_as_given(run, config))
@@ -102,7 +106,7 @@ def _detect(
     return tuple(kept), tuple(notes)
 
 
-def _solve_surest(
+def solve_choices(
     recording: Recording,
     config: CalibrationConfig,
     views: tuple[View, ...],
@@ -116,8 +120,7 @@ def _solve_surest(
         told = run.result.status in ("ok", "weak")
         return not told, run.result.observability["working_point_sigma_mm"] if told else np.inf
 
-    draft = _without_joint_offsets(config)
-    return min((_solve(recording, draft, views, poses, choices, progress) for choices in attempts), key=rank)
+    return min((_solve(recording, config, views, poses, choices, progress) for choices in attempts), key=rank)
 
 
 def _without_joint_offsets(config: CalibrationConfig) -> CalibrationConfig:

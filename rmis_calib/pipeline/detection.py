@@ -207,7 +207,7 @@ def _detect_views(
             finish_one()
     views = []
     for c in cameras:
-        found = _over_all(concatenate(parts[c.side]), c.source.count, config.every)
+        found = over_all(concatenate(parts[c.side]), c.source.count, slice(None, None, config.every))
         change = torch.full((c.source.count,), torch.inf)
         change[:: config.every] = torch.cat(changes[c.side]).cpu()
         views.append(View(c.side, c.source, c.camera, found, change))
@@ -256,13 +256,11 @@ def concatenate(parts: list[ShaftDetections]) -> ShaftDetections:
     return ShaftDetections(**joined)
 
 
-def _over_all(found: ShaftDetections, count: int, every: int) -> ShaftDetections:
-    """Detections of every n-th frame, as those of all `count` frames."""
-    if every == 1:
-        return found
+def over_all(found: ShaftDetections, count: int, searched: slice | Tensor) -> ShaftDetections:
+    """Detections of the searched frames, as those of all `count` frames."""
     spread = {}
     for name, value in vars(found).items():
         empty = torch.nan if value.is_floating_point() else int(FrameReason.LEFT_OUT) if name == "reason" else False
         spread[name] = value.new_full((count, *value.shape[1:]), empty)
-        spread[name][::every] = value
+        spread[name][searched] = value
     return ShaftDetections(**spread)

@@ -18,6 +18,7 @@ from rmis_calib.pipeline.association import Choice
 from rmis_calib.pipeline.observations import ANOTHER_INSTRUMENT
 from rmis_calib.pipeline.offset_unknowns import KinematicUnknowns, poses_at_motions
 from rmis_calib.pipeline.run import CalibrationRun
+from rmis_calib.pipeline.stereo_order import looks_swapped, median_inverse_depth
 from rmis_calib.results import CalibrationResult
 from rmis_calib.solver import MotionReason, SolveStatus
 from rmis_calib.vision import FrameReason, ShaftDetections
@@ -69,24 +70,10 @@ def with_misfit_named(
             later = None if moved is None else moved.predicted_contours(view)
             off = run.result.intrinsic_correction(view.side)
             parts.append(signed_residuals(detections, choice, now, later, VELOCITY_STEP_S, view.camera, off))
+    depth = median_inverse_depth(run.recording.stereo.camera_left_T_camera_right, found, run.choices)
     repeated = sum(reason == FrameReason.REPEATED.sentence for reason in result.motions.reasons)
-    causes = likely_causes(joined_residuals(parts), _disparity(run, found), repeated) if parts else []
+    causes = likely_causes(joined_residuals(parts), depth, repeated) if parts else []
     return replace(kept, result=replace(result, message=misfit_message(result, causes)))
-
-
-def _disparity(run: CalibrationRun, found: list[ShaftDetections]) -> float | None:
-    """Median of x_left - x_right of the shaft's end, signed by the baseline; negative where the cameras are swapped."""
-    extrinsics = run.recording.stereo.camera_left_T_camera_right
-    if extrinsics is None or len(found) < 2:
-        return None
-    ends_x = []
-    for detections, choice in zip(found, run.choices, strict=True):
-        rows = torch.arange(len(choice.candidate), device=choice.candidate.device)
-        xy = torch.where(detections.end_valid[..., None], detections.end_xy, torch.nan)
-        chosen = xy[rows, choice.candidate.clamp_min(0)]
-        ends_x.append(torch.where(choice.taken[:, None], chosen, torch.nan)[:, 0].double())
-    gap = (ends_x[1] - ends_x[0]) * torch.sign(extrinsics.t[0]).to(ends_x[0].device)
-    return float(gap.nanmedian()) if bool(torch.isfinite(gap).any()) else None
 
 
 def misfit_message(result: CalibrationResult, causes: list[str]) -> str:
@@ -126,19 +113,18 @@ def is_misfit(result: CalibrationResult) -> bool:
     return contradicting > int(result.motions.used.sum())
 
 
-def likely_causes(residuals: SignedResiduals, disparity: float | None, repeated: int) -> list[str]:
+def likely_causes(residuals: SignedResiduals, inverse_depth: float | None, repeated: int) -> list[str]:
     """Causes in words, the most likely first.
 
     Args:
         residuals: of all motions and cameras that measured the shaft.
-        disparity: median of x_left - x_right of the same places times the sign of the baseline, normalised units:
-            positive where both cameras are what they are called; None for one camera.
+        inverse_depth: of the shaft in both cameras (`median_inverse_depth`), 1/mm; None where they do not tell it.
         repeated: pictures that repeat the one before although the joints moved.
     """
     causes = []
     if repeated:
         causes.append(f"{repeated} pictures repeat the one before (a grabber that hangs)")
-    if disparity is not None and disparity < 0:
+    if looks_swapped(inverse_depth):
         causes.append("the left and the right pictures look swapped")
     u, v = residuals.uv.T
     by = {

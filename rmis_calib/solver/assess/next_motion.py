@@ -117,7 +117,7 @@ def advise(
 
     before, *now = left(information)
     view = _narrowed(view, now[1] / torch.linalg.vector_norm(working_point_mm))
-    gain, visible = _predicted_information(candidates, posterior, view, settings)
+    gain, visible = predicted_information(candidates, posterior, view, settings)
     chosen, path = [], [now]
     alone = torch.full_like(gain[:, 0, 0], torch.inf)
     open_ = visible
@@ -154,10 +154,17 @@ def _alike(candidates: Problem, index: int) -> Bool[Tensor, " m"]:
     return (cosine.acos() < ALIKE_RAD) & near & along
 
 
-def _predicted_information(
+def predicted_information(
     candidates: Problem, posterior: Posterior, view: Float[Tensor, "c 4"], settings: SolverSettings
 ) -> tuple[Float[Tensor, "m p p"], Bool[Tensor, " m"]]:
-    """What each candidate would add to the information, and whether some camera sees it."""
+    """What each candidate would add to the information of all unknowns, and whether some camera sees it.
+
+    Args:
+        candidates: one trial of poses; finite measurements in it say which kinds would be measured.
+        posterior: of the estimate that predicts what would be seen, one trial.
+        view: least x, least y, greatest x, greatest y in each camera's picture, normalised units.
+        settings: as in the estimate.
+    """
     each, seen = [], []
     for n in range(0, candidates.n_motions, settings.chunk):
         part = candidates.select_motions(slice(n, n + settings.chunk))
