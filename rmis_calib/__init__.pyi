@@ -40,6 +40,7 @@ from .solver.model.pose_refinement import refine as refine
 from .solver.own_measurement import Measurement as Measurement
 from .studies import study_motions as study_motions
 from .studies import study_noise as study_noise
+from .studies import study_plan as study_plan
 from .vision import ShaftDetector as ShaftDetector
 
 __version__: str

@@ -15,12 +15,12 @@ from rich.console import Console
 from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bars
 
-from rmis_calib.cli import EXIT_BAD_INPUT, EXIT_OK
+from rmis_calib.cli import EXIT_BAD_INPUT, EXIT_NOT_TRUSTWORTHY, EXIT_OK
 from rmis_calib.cli.console import LOG_INTERVAL_S, say, time_left
 from rmis_calib.cli.usage import parse_arguments
 from rmis_calib.errors import InputError
 from rmis_calib.io.configs import did_you_mean
-from rmis_calib.studies.settings import MotionsStudySettings, NoiseStudySettings
+from rmis_calib.studies.settings import MotionsStudySettings, NoiseStudySettings, PlanSettings
 
 if TYPE_CHECKING:
     from rmis_calib.studies.engine import Progress
@@ -74,9 +74,29 @@ class Motions(_Study):
             return conclude_study(study_motions(self.out, self.settings, progress=progress, command=self.command))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Plan(_Study):
+    """How many motions a wanted error at the working point takes, on your robot and with your cameras.
+
+    Writes OUT/index.html, plan.pdf, plan.png, trials.csv, trials.parquet and summary.csv. Exit code 1 where no number
+    of motions suffices.
+    """
+
+    out: Path = Path("study_plan")
+    """Folder to write, or to go on with."""
+    settings: tyro.conf.OmitArgPrefixes[PlanSettings] = field(default_factory=PlanSettings)
+
+    def run(self) -> int:
+        from rmis_calib.studies import study_plan
+
+        with study_reporter() as progress:
+            return conclude_study(study_plan(self.out, self.settings, progress=progress, command=self.command))
+
+
 STUDIES: dict[str, tuple[type, str]] = {
     "noise": (Noise, "error against noise, by method and number of cameras (Fig. 2)"),
     "motions": (Motions, "error against the number of motions, by which arm moves (Fig. 3)"),
+    "plan": (Plan, "how many motions a wanted accuracy takes"),
 }
 
 
@@ -149,7 +169,7 @@ def conclude_study(result: "StudyResult") -> int:
     for sentence in result.sentences:
         say(sentence)
     say(f"written: {result.page}")
-    return EXIT_OK
+    return EXIT_OK if result.reached else EXIT_NOT_TRUSTWORTHY
 
 
 def _print_table(table: "Table") -> None:

@@ -114,13 +114,12 @@ def _ticks(values: list[float]) -> list[float]:
 
 def _draw_method(axes: Axes, series: Series) -> None:
     place = series.style.index % len(COLOURS)
-    x, middle = np.asarray(series.x), np.asarray(series.middle)
-    low, high = np.asarray(series.low), np.asarray(series.high)
-    shown = np.isfinite(middle)
+    shown = np.isfinite(series.middle)
+    x, middle, low, high = (np.asarray(v)[shown] for v in (series.x, series.middle, series.low, series.high))
     colour = COLOURS[place]
-    bars = np.stack([middle - low, np.where(np.isfinite(high), high, middle) - middle])[:, shown]
+    bars = np.stack([middle - low, np.where(np.isfinite(high), high, middle) - middle])
     axes.errorbar(
-        x[shown], middle[shown], yerr=bars, color=colour, marker=MARKERS[place], markersize=3.2,
+        x, middle, yerr=bars, color=colour, marker=MARKERS[place], markersize=3.2,
         linewidth=1.0 if series.style.has_line else 0.0, elinewidth=0.7, capsize=1.5, capthick=0.7,
         label=series.name if series.style.has_line else None,  # hollow points are for the caption
 

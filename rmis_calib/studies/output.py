@@ -33,6 +33,7 @@ class StudyResult:
         figures: what was drawn.
         tables: what was found, in print.
         folder: where all of it is.
+        reached: whether what was asked for can be had (`plan`).
     """
 
     kind: str
@@ -42,6 +43,7 @@ class StudyResult:
     figures: tuple[Figure, ...]
     tables: tuple[Table, ...]
     folder: Path
+    reached: bool = True
 
     @property
     def page(self) -> Path:

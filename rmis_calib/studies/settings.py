@@ -54,7 +54,7 @@ class RunSettings:
     """How a study is run."""
 
     trials: Count | None = None
-    """Trials of every condition. Default: 100, and 8 with --quick."""
+    """Trials of every condition. Default: 100, and 8 with --quick; of `plan` 200 and 40."""
     seed: Annotated[int, Field(ge=0)] = 0
     """Seed of everything random."""
     quick: bool = False
@@ -114,3 +114,40 @@ class MotionsStudySettings:
     """What is simulated."""
     run: RunSettings = RunSettings()
     """How it is run."""
+
+
+@dataclass(frozen=True, config=_STRICT)
+class PlanSettings:
+    """How many motions a wanted accuracy takes."""
+
+    wanted_mm: Positive = 1.0
+    """Wanted error at the working point."""
+    wanted_deg: Positive | None = None
+    """Wanted rotation error, too."""
+    confidence: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.9
+    """Share of recordings that must reach it."""
+    most_motions: Annotated[int, Field(ge=4)] = 512
+    """Largest number of motions to consider."""
+    methods: tuple[str, ...] = ("joint",)
+    """Methods; the answer is of the first one. `joint` uses what `calibrate` uses, joint-axis the paper's lines."""
+    cameras: tuple[Cameras, ...] = ("stereo",)
+    """Cameras used; the answer is of the first one."""
+    laparoscope: Literal["moves", "still"] = "moves"
+    """Whether the laparoscope moves, too."""
+    kinematics_noise_mm: NotNegative = 0.3
+    """Noise of the kinematics, 1 sigma per axis of every motion's `arm_T_rcm`."""
+    kinematics_noise_deg: NotNegative = 0.1
+    """Rotational part of the same."""
+    stereo_noise_mm: NotNegative = 0.05
+    """Error of the stereo extrinsics, 1 sigma per axis."""
+    stereo_noise_deg: NotNegative = 0.05
+    """Rotational part of the same."""
+    setup: SetupSettings = SetupSettings()
+    """What is simulated."""
+    run: RunSettings = RunSettings()
+    """How it is run."""
+
+    @property
+    def n_trials(self) -> int:
+        """A share of recordings takes more trials than a median."""
+        return self.run.trials or (40 if self.run.quick else 200)

@@ -3,6 +3,8 @@
 import torch
 
 import rmis_calib as rc
+from rmis_calib.studies.settings import SetupSettings
+from rmis_calib.studies.simulation import make_setup
 
 
 @rc.studies.method("nothing", "the identity", measurements=("axis",))
@@ -19,3 +21,12 @@ def shift_ten_mm(data, coefficient, generator):
 @rc.studies.noise_source("shifted", "Constant error", disturb=shift_ten_mm)
 def shifted(coefficient):
     return {}
+
+
+@rc.studies.method("root-of-n", "off by 10 mm over the root of the motions")
+def root_of_n(problem):
+    """Its error is known without trials."""
+    exact = make_setup(SetupSettings()).scene.camera_right_T_arm
+    estimate = torch.tensor(exact).repeat(problem.n_trials, 1, 1)
+    estimate[:, 2, 3] += 10.0 / problem.n_motions**0.5
+    return estimate

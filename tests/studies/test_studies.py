@@ -21,7 +21,13 @@ from rmis_calib.solver import Problem, solve
 from rmis_calib.studies import cells, measures
 from rmis_calib.studies.builtin import SETTINGS
 from rmis_calib.studies.registry import find_method
-from rmis_calib.studies.settings import MotionsStudySettings, NoiseStudySettings, RunSettings, SetupSettings
+from rmis_calib.studies.settings import (
+    MotionsStudySettings,
+    NoiseStudySettings,
+    PlanSettings,
+    RunSettings,
+    SetupSettings,
+)
 from rmis_calib.studies.simulation import Condition, make_setup, simulate
 
 OWN = Path(__file__).with_name("own_things.py")
@@ -250,6 +256,38 @@ def test_motions_are_split_over_the_arms_in_every_way(tmp_path) -> None:
     lines = {series.name: series.x for series in both.series}
     assert lines["joint, contours"] == (216.0,)  # a product that is prime has no such split
     assert lines["joint, contours, other splits"] == (216.0,)
+
+
+def test_the_plan_finds_the_number_of_motions(tmp_path) -> None:
+    """Of a method that is off by 10 mm / sqrt(N): 1 mm takes 100 motions. Tried: 96, 128, then 104, 112 and 120."""
+    run = RunSettings(trials=2, workers=1, extensions=(OWN,))
+    settings = PlanSettings(methods=("root-of-n",), wanted_mm=1.0, most_motions=200, run=run)
+    result = rc.study_plan(tmp_path / "out", settings)
+    assert result.reached
+    assert result.sentences[0].startswith(
+        "104 motions reach 1 mm at the working point: 90 % of recordings are within 0.98"
+    )
+    assert {row["motions"] for row in result.summary} == {
+        4,
+        6,
+        8,
+        12,
+        16,
+        24,
+        32,
+        48,
+        64,
+        96,
+        104,
+        112,
+        120,
+        128,
+        192,
+        200,
+    }
+    result = rc.study_plan(tmp_path / "out", replace(settings, wanted_mm=0.5))
+    assert not result.reached
+    assert "200 motions are not enough for 0.5 mm" in result.sentences[0]
 
 
 def test_folders_of_others_are_left_alone(tmp_path) -> None:
