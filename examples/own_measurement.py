@@ -56,7 +56,7 @@ def main() -> tuple[rc.CalibrationResult, rc.CalibrationResult]:
             "no answer" if found is None else f"{np.linalg.norm(found.matrix[:3, 3].numpy() - truth[:3, 3]):.2f} mm off"
         )
         print(f"{words}: {result.status}, 1 sigma {result.translation_sigma_mm:.2f} mm, {error}")
-    print(f"residual of the marker: rms {after.residuals['tracked marker']['rms']:.2f} mm")
+    print(f"residual of the marker: rms {after.residuals['tracked marker'].rms:.2f} mm")
     return before, after
 
 

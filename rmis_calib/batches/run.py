@@ -21,11 +21,12 @@ from rmis_calib.errors import InputError, OutputError
 from rmis_calib.io.atomic import write_json
 from rmis_calib.io.folders import natural_order
 from rmis_calib.io.outputs import check_apart, check_file, is_json_of, remove_own
+from rmis_calib.io.plain_values import finite_or_none
 from rmis_calib.parallel import cluster
 from rmis_calib.parallel.lock import locked
 from rmis_calib.parallel.processes import Event, Limits, cores, free_memory_bytes, run_tasks
 from rmis_calib.pipeline.device import require_device
-from rmis_calib.results import CalibrationResult, finite_or_none
+from rmis_calib.results import CalibrationResult
 
 MANIFEST, MANIFEST_FORMAT = "batch.json", "rmis-calib-batch/1"
 BATCH_LOG = "batch.log"

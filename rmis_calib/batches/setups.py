@@ -142,17 +142,17 @@ def _drifts(results: Sequence[CalibrationResult]) -> tuple[Drift, ...]:
     found = []
     for name in names:
         entries = [result.nuisances[name] for result in results]
-        values, sigmas = (np.array([entry[key] for entry in entries], dtype=float) for key in ("value", "sigma"))
+        values, sigmas = (np.array([getattr(entry, key) for entry in entries]) for key in ("value", "sigma"))
         slope, probability = drift(values, sigmas)
         probability = min(1.0, probability * len(names))
         if probability < SIGNIFICANT:
-            found.append(Drift(name, slope, entries[0]["unit"], probability))
+            found.append(Drift(name, slope, entries[0].unit, probability))
     return tuple(found)
 
 
 def _is_estimated(result: CalibrationResult, name: str) -> bool:
-    entry = result.nuisances.get(name, {})
-    return bool(entry.get("sigma")) and not entry.get("held")
+    entry = result.nuisances.get(name)
+    return entry is not None and bool(entry.sigma) and not entry.held
 
 
 def _about(agreement: Agreement, count: int) -> str:

@@ -24,7 +24,8 @@ from rmis_calib.batches.jobs import Job
 from rmis_calib.errors import OutputError, RmisCalibError
 from rmis_calib.io.atomic import atomic_directory, write_json
 from rmis_calib.io.configs import load_json
-from rmis_calib.results import finite_or_none
+from rmis_calib.io.plain_values import finite_or_none
+from rmis_calib.results import Nuisance
 
 if TYPE_CHECKING:
     from rmis_calib.io import RecordingDescription
@@ -231,24 +232,23 @@ def row_of_run(run: "CalibrationRun", description: "RecordingDescription") -> di
 
 def row_of_result(result: "CalibrationResult") -> dict[str, Any]:
     """What the summary shows of a result: plain values, lengths in mm, angles in degrees."""
-    nuisances = result.nuisances
-    clock = nuisances.get("clock", {"value": None, "sigma": None})
+    clock = result.nuisances.get("clock", Nuisance(value=None, sigma=None, unit="s"))
     row: dict[str, Any] = {
         "status": result.status,
         "method": result.method,
         "rotation_sigma_deg": result.rotation_sigma_deg,
         "translation_sigma_mm": result.translation_sigma_mm,
-        "working_point_sigma_mm": result.observability.get("working_point_sigma_mm"),
+        "working_point_sigma_mm": result.observability.working_point_sigma_mm,
         "motions": len(result.motions.used),
         "motions_used": int(result.motions.used.sum()),
-        "clock_s": None if clock["value"] is None else round(clock["value"], 9),  # rounding is no offset
-        "clock_sigma_s": clock["sigma"],
+        "clock_s": None if clock.value is None else round(clock.value, 9),  # rounding is no offset
+        "clock_sigma_s": clock.sigma,
         "notes": list(result.notes),
     }
     for name, residual in result.residuals.items():
-        row[f"residual_{name}_{residual['unit'].replace(' ', '_')}"] = residual["median"]
+        row[f"residual_{name}_{residual.unit.replace(' ', '_')}"] = residual.median
     for side, error in (result.head_point_error_px or {}).items():
-        row[f"head_point_{side}_px"] = error["median"]
+        row[f"head_point_{side}_px"] = error.median
     return row
 
 

@@ -40,8 +40,8 @@ from rmis_calib.io.outputs import (
     is_json_of,
 )
 from rmis_calib.io.validation import first_finding
+from rmis_calib.solver.settings import Method
 
-Method = Literal["paper", "global", "joint"]
 Settings = Annotated[CalibrationConfig, tyro.conf.arg(name="")]
 
 
@@ -270,8 +270,9 @@ class Evaluate:
             check_apart(self.out, [*description.inputs, *inputs])
             check_file(self.out, is_json_of(EVALUATION_FORMAT), self.overwrite)
         from rmis_calib.io import load_recording, write_json
+        from rmis_calib.io.plain_values import finite_or_none
         from rmis_calib.pipeline import evaluate
-        from rmis_calib.results import CalibrationResult, finite_or_none
+        from rmis_calib.results import CalibrationResult
 
         evaluation = evaluate(CalibrationResult.read(self.result), load_recording(description), self.truth)
         print_table("evaluation", evaluation.rows())

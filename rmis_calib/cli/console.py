@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,7 @@ from rmis_calib.cli import EXIT_NOT_TRUSTWORTHY, EXIT_OK
 
 if TYPE_CHECKING:
     from rmis_calib.pipeline import RecordingCheck
-    from rmis_calib.results import CalibrationResult
+    from rmis_calib.results import CalibrationResult, Nuisance
 
 ProgressCallback = Callable[[str, int, int], None]
 LOG_INTERVAL_S = 5.0
@@ -80,7 +80,7 @@ def time_left(seconds: float | None) -> str:
     )
 
 
-def print_advice(sentences: list[str]) -> None:
+def print_advice(sentences: Sequence[str]) -> None:
     """What would make the next recording better, one line a step; nothing where there is no advice."""
     if sentences:
         console.print("what to record next", soft_wrap=True)
@@ -102,7 +102,7 @@ def conclude(result: "CalibrationResult", written: Path) -> int:
     for note in result.notes:
         say(f"note: {note}")
     if not result.trustworthy:
-        print_advice(result.observability.get("advice") or [])
+        print_advice(result.observability.advice)
     say(f"written: {written}\n")
     return EXIT_OK if result.trustworthy else EXIT_NOT_TRUSTWORTHY
 
@@ -138,14 +138,20 @@ def result_rows(result: "CalibrationResult") -> list[tuple[str, str]]:
     rows.append(("motions used", f"{used} of {total} (method {result.method})"))
     rows += [(f"  {count} rejected", reason) for reason, count in result.motions.rejected_by_reason.items()]
     for kind, residual in result.residuals.items():
-        if residual["median"] is not None:
-            rows.append((f"residual, {kind.replace('_', ' ')}", f"median {residual['median']:.3g} {residual['unit']}"))
+        if residual.median is not None:
+            rows.append((f"residual, {kind.replace('_', ' ')}", f"median {residual.median:.3g} {residual.unit}"))
     for name, nuisance in result.nuisances.items():
         # Hundredths of a pixel, and corrections that are said in words where they matter: for result.json and report.
         if name.startswith("edge_bias") or name.partition(" ")[0] in INTRINSICS:
             continue
-        sigma = "" if nuisance["sigma"] is None else f" +- {nuisance['sigma']:.2g}"
-        held = " (held by its prior)" if nuisance.get("held") else ""
-        value = 0.0 if abs(nuisance["value"]) < 1e-9 * (nuisance["sigma"] or 0.0) else nuisance["value"]  # rounding
-        rows.append((name.replace("_", " "), f"{value:.4g}{sigma} {nuisance['unit']}{held}"))
+        sigma = "" if nuisance.sigma is None else f" +- {nuisance.sigma:.2g}"
+        held = " (held by its prior)" if nuisance.held else ""
+        rows.append((name.replace("_", " "), f"{_value(nuisance)}{sigma} {nuisance.unit}{held}"))
     return rows
+
+
+def _value(nuisance: "Nuisance") -> str:
+    if nuisance.value is None:
+        return "unknown"
+    is_rounding = abs(nuisance.value) < 1e-9 * (nuisance.sigma or 0.0)
+    return f"{0.0 if is_rounding else nuisance.value:.4g}"

@@ -44,7 +44,7 @@ class Answer:
         recorded = 0.0 if self.placement is None else self.placement.clock_offset_s
         found = self.result.nuisances.get("clock")
         # One that its prior holds is no more than rounding.
-        return recorded + (self.result.kinematic_offsets.clock_s if found and not found["held"] else 0.0)
+        return recorded + (self.result.kinematic_offsets.clock_s if found and not found.held else 0.0)
 
     @property
     def sides(self) -> tuple[Side, ...]:

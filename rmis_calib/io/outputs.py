@@ -10,6 +10,7 @@ import os
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Final
 
 from rmis_calib import __version__
 from rmis_calib.errors import FileError, InputError, OutputError
@@ -17,7 +18,7 @@ from rmis_calib.io.configs import check_regular, load_json
 
 MARKER = ".rmis-calib-output.json"
 MARKER_FORMAT = "rmis-calib-output/1"
-RESULT_FORMAT = "rmis-calib-result/1"
+RESULT_FORMAT: Final = "rmis-calib-result/1"
 EVALUATION_FORMAT = "rmis-calib-evaluation/1"
 OBSERVATIONS_FORMAT = "rmis-calib-observations/1"
 HTML_GENERATOR = '<meta name="generator" content="rmis-calib">'

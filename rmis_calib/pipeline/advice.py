@@ -10,7 +10,6 @@ worth making. The estimate that predicts all this is the present one.
 import math
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 import torch
@@ -30,7 +29,7 @@ from rmis_calib.pipeline.words import joined
 from rmis_calib.robot import split_joint_column
 from rmis_calib.solver import Problem, Solution, SolveStatus
 from rmis_calib.solver.assess.next_motion import Advice, advise, measured_alike
-from rmis_calib.solver.observability import Verdict
+from rmis_calib.solver.observability import NextMotion, Observability, Verdict
 from rmis_calib.solver.settings import AdviceSettings
 
 VIEW_MARGIN = 0.05
@@ -110,21 +109,23 @@ def with_next_motions(run: CalibrationRun, config: CalibrationConfig) -> Calibra
     stereo = run.recording.stereo
     cameras = [camera for camera in (stereo.right, stereo.left) if camera is not None][: problem.n_cameras]
     view = torch.stack([camera_view(camera) for camera in cameras]).to(config.device)
-    record = advice_record(run.solution, candidates, view, config, limits_in_words(settings))
-    result = replace(run.result, observability=run.result.observability | record)
-    return replace(run, result=result)
+    limits = limits_in_words(settings)
+    observability = with_advice(run.result.observability, run.solution, candidates, view, config, limits)
+    return replace(run, result=replace(run.result, observability=observability))
 
 
-def advice_record(
+def with_advice(
+    observability: Observability,
     solution: Solution,
     candidates: Candidates,
     view: Float[Tensor, "c 4"],
     config: CalibrationConfig,
     where: str,
-) -> dict[str, Any]:
-    """`advice` (sentences) and `next_motions` (the same as values) of `observability` in a result.
+) -> Observability:
+    """With `advice` (sentences) and `next_motions` (the same as values).
 
     Args:
+        observability: of the result.
         solution: one trial of which `may_advise` is true.
         candidates: motions to choose from.
         view: field of view of each camera (`advise`).
@@ -132,22 +133,23 @@ def advice_record(
         where: to what the candidates were limited, to end the advice with.
     """
     if solution.posterior is None:
-        return {}
+        return observability
     point = solution.observability.working_point_mm[0]
     reported = solution.covariance.reshape(6, 6)
     advice = advise(candidates.problem, solution.posterior, point, view, config.solver, candidates.effort, reported)
-    trusted = solution.observability.describe().verdict is Verdict.TRUSTWORTHY
+    trusted = observability.verdict is Verdict.TRUSTWORTHY
     general = () if trusted else solution.observability.remedies()
-    return {
-        "advice": _sentences(solution, candidates, advice, where) + [f"In general: {words}." for words in general],
-        "next_motions": [_values(candidates, advice, step) for step in range(len(advice.chosen))],
-    }
+    return replace(
+        observability,
+        advice=(*_sentences(solution, candidates, advice, where), *(f"In general: {words}." for words in general)),
+        next_motions=tuple(_next_motion(candidates, advice, step) for step in range(len(advice.chosen))),
+    )
 
 
 def _sentences(solution: Solution, candidates: Candidates, advice: Advice, where: str) -> list[str]:
     if not len(advice.chosen):
         return [f"The present estimate predicts no motion {where} that would keep the shaft in view."]
-    _, name = solution.observability.describe().directions[0]
+    name = solution.observability.describe().directions[0].words
     sigma = [_mm(value) for value in advice.weakest_mm.tolist()]
     out = []
     for step, index in enumerate(advice.chosen.tolist()):
@@ -169,17 +171,17 @@ def _mm(value: float) -> str:
     return f"{value:.{max(1 - math.floor(math.log10(max(value, 1e-4))), 0)}f} mm"
 
 
-def _values(candidates: Candidates, advice: Advice, step: int) -> dict[str, Any]:
+def _next_motion(candidates: Candidates, advice: Advice, step: int) -> NextMotion:
     index = int(advice.chosen[step])
     joints = None
     if candidates.joints is not None:
         joints = dict(zip(candidates.columns, candidates.joints[index].tolist(), strict=True))
-    return {
-        "words": candidates.words[index],
-        "joints": joints,
-        "weakest_sigma_mm": float(advice.weakest_mm[step + 1]),
-        "working_point_sigma_mm": float(advice.point_mm[step + 1]),
-    }
+    return NextMotion(
+        words=candidates.words[index],
+        joints=joints,
+        weakest_sigma_mm=float(advice.weakest_mm[step + 1]),
+        working_point_sigma_mm=float(advice.point_mm[step + 1]),
+    )
 
 
 def joint_candidates(

@@ -22,7 +22,7 @@ from rmis_calib.pipeline.observations import assemble
 from rmis_calib.pipeline.offset_unknowns import estimated_offsets, poses_at, recording_unknowns, with_rcm_offset
 from rmis_calib.pipeline.offsets import estimate_with_kinematics
 from rmis_calib.pipeline.poses import MotionPoses, motion_poses
-from rmis_calib.pipeline.result import insufficient_data, make_result, motions_of, residual_record, residuals_px
+from rmis_calib.pipeline.result import insufficient_data, make_result, motions_of, residual_of, residuals_px
 from rmis_calib.pipeline.run import CalibrationRun
 from rmis_calib.results import CalibrationResult
 from rmis_calib.vision.masks import Segmenter
@@ -118,7 +118,8 @@ def solve_choices(
 
     def rank(run: CalibrationRun) -> tuple[bool, float]:
         told = run.result.status in ("ok", "weak")
-        return not told, run.result.observability["working_point_sigma_mm"] if told else np.inf
+        sigma_mm = run.result.observability.working_point_sigma_mm
+        return not told, sigma_mm if told and sigma_mm is not None else np.inf
 
     return min((_solve(recording, config, views, poses, choices, progress) for choices in attempts), key=rank)
 
@@ -215,8 +216,7 @@ def _solve(
     poses = with_rcm_offset(poses, result.kinematic_offsets.rcm_mm)
     errors = head_point_errors(result, recording, poses_at(recording, result.kinematic_offsets, config.device))
     residuals = result.residuals | {
-        f"head_{side}": residual_record(distance, "px", np.isfinite(distance))
-        for side, distance in (errors or {}).items()
+        f"head_{side}": residual_of(distance, "px", np.isfinite(distance)) for side, distance in (errors or {}).items()
     }
     result = replace(result, residuals=residuals, head_point_error_px=summarise_head_points(errors))
     return CalibrationRun(result, recording, views, poses, choices, observations, solution)

@@ -10,15 +10,16 @@ import torch
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.errors import CalibrationFailed, InputError
 from rmis_calib.io import ShaftObservations
-from rmis_calib.pipeline.advice import WHERE, advice_record, may_advise, pose_candidates, seen_view
+from rmis_calib.pipeline.advice import WHERE, may_advise, pose_candidates, seen_view, with_advice
 from rmis_calib.pipeline.device import require_device
 from rmis_calib.pipeline.observations import problem_of
 from rmis_calib.pipeline.offset_unknowns import FileUnknowns, estimated_offsets, file_unknowns
 from rmis_calib.pipeline.offsets import estimate_with_kinematics
-from rmis_calib.pipeline.result import make_result, residual_record, residuals_normalised, used_motions
+from rmis_calib.pipeline.result import make_result, residual_of, residuals_normalised, used_motions
 from rmis_calib.results import CalibrationResult, Motions
 from rmis_calib.solver import Problem, Solution
 from rmis_calib.solver import solve as solve_problem
+from rmis_calib.solver.observability import Observability
 from rmis_calib.solver.own_measurement import Measurement
 
 
@@ -90,25 +91,26 @@ def solve(
     for item in measurements:
         if item.name in solution.residual_own:
             by_motion = solution.residual_own[item.name].cpu().numpy()
-            residuals[item.name] = residual_record(by_motion, item.unit, motions.used)
+            residuals[item.name] = residual_of(by_motion, item.unit, motions.used)
     result = make_result(solution, motions, residuals, config, columns, notes)
-    advice = _advice(solution, motions, observations, config, unknowns)
-    result = replace(result, observability=result.observability | advice)
+    advice = _advised(result.observability, solution, motions, observations, config, unknowns)
+    result = replace(result, observability=advice)
     if throw:
         raise_unless_trustworthy(result)
     return result
 
 
-def _advice(
+def _advised(
+    observability: Observability,
     solution: Solution,
     motions: Motions,
     observations: ShaftObservations,
     config: CalibrationConfig,
     unknowns: FileUnknowns | None,
-) -> dict[str, Any]:
-    """What motion would help most, as the picture shows it."""
+) -> Observability:
+    """With the motions that would help most, as the picture shows them."""
     if not may_advise(solution, config) or not motions.used.any():
-        return {}
+        return observability
     problem = problem_of(observations, config).flatten_batch()
     if unknowns is not None:
         joint_offset, clock_s = estimated_offsets(solution, unknowns.columns, problem.radius_mm)
@@ -116,7 +118,7 @@ def _advice(
         problem = unknowns.linearised(problem, joint_offset[None], clock, torch.zeros_like(joint_offset))
     last = int(np.flatnonzero(motions.used)[-1])
     candidates = pose_candidates(problem, solution, last, config.solver.advice)
-    return advice_record(solution, candidates, seen_view(problem), config, WHERE)
+    return with_advice(observability, solution, candidates, seen_view(problem), config, WHERE)
 
 
 def estimate(

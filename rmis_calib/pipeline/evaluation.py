@@ -1,7 +1,7 @@
 """How good a result is: head-point reprojection error, and the distance to a known truth."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from rmis_calib.io._checks import no_note, rigid_from_text
 from rmis_calib.io.configs import load_json
 from rmis_calib.pipeline.offset_unknowns import poses_at
 from rmis_calib.pipeline.poses import MotionPoses
-from rmis_calib.results import CalibrationResult
+from rmis_calib.results import CalibrationResult, HeadPointError
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Evaluation:
     """Measures of one result.
 
     Attributes:
-        head_point_error_px: per camera `{median, rms, max, count}`; None without head points.
+        head_point_error_px: per camera; None without head points.
         rotation_error_deg: angle between the result and the reference; None without a reference.
         translation_error_mm: distance between the two translations.
         error_sigmas: Mahalanobis distance of the error under the sum of both covariances (6 degrees of freedom).
@@ -45,7 +45,7 @@ class Evaluation:
         reference_sigma_deg, reference_sigma_mm: of the reference; zero for one that counts as exact.
     """
 
-    head_point_error_px: dict[str, dict[str, float]] | None
+    head_point_error_px: dict[str, HeadPointError] | None
     rotation_error_deg: float | None = None
     translation_error_mm: float | None = None
     error_sigmas: float | None = None
@@ -55,14 +55,14 @@ class Evaluation:
     reference_sigma_mm: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        return dict(vars(self))
+        return asdict(self)
 
     def rows(self) -> list[tuple[str, str]]:
         """What a table shows."""
         rows = []
         for camera, error in (self.head_point_error_px or {}).items():
-            text = f"median {error['median']:.2f} px, rms {error['rms']:.2f} px, max {error['max']:.2f} px"
-            rows.append((f"head point, camera_{camera}", f"{text} ({error['count']:.0f} points)"))
+            text = f"median {error.median:.2f} px, rms {error.rms:.2f} px, max {error.max:.2f} px"
+            rows.append((f"head point, camera_{camera}", f"{text} ({error.count} points)"))
         if self.rotation_error_deg is not None and self.translation_error_mm is not None:
             rows.append(("rotation error", f"{self.rotation_error_deg:.3f} deg"))
             rows.append(("translation error", f"{self.translation_error_mm:.3f} mm"))
@@ -132,7 +132,7 @@ def head_point_errors(
     return errors
 
 
-def summarise_head_points(errors: dict[str, np.ndarray] | None) -> dict[str, dict[str, float]] | None:
+def summarise_head_points(errors: dict[str, np.ndarray] | None) -> dict[str, HeadPointError] | None:
     """Median, root mean square and maximum over the labelled frames of each camera."""
     if errors is None:
         return None
@@ -141,8 +141,7 @@ def summarise_head_points(errors: dict[str, np.ndarray] | None) -> dict[str, dic
         known = distance[np.isfinite(distance)]
         if len(known):
             rms = float(np.sqrt(np.mean(known**2)))
-            summary[name] = {"median": float(np.median(known)), "rms": rms, "max": float(known.max())}
-            summary[name]["count"] = len(known)
+            summary[name] = HeadPointError(float(np.median(known)), rms, float(known.max()), len(known))
     return summary or None
 
 

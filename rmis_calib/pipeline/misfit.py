@@ -78,10 +78,10 @@ def with_misfit_named(
 
 def misfit_message(result: CalibrationResult, causes: list[str]) -> str:
     """The result's message with the misfit first, its likely causes, and only then what else was to be said."""
-    levels = {name: result.nuisances.get(name, {}).get("value") for name in TOO_NOISY}
+    levels = {name: result.nuisance(name) for name in TOO_NOISY}
     mm, rad = levels[_MM], levels[_RAD]
     size = ""
-    if mm is not None and rad is not None and (mm > TOO_NOISY[_MM] or rad > TOO_NOISY[_RAD]):
+    if mm > TOO_NOISY[_MM] or rad > TOO_NOISY[_RAD]:
         size = f" (as if the joints were noisy by {mm:.2g} mm and {np.rad2deg(rad):.2g} deg)"
     likely = "; then: ".join(causes)
     head, _, rest = result.message.partition(": ")
@@ -106,8 +106,8 @@ class SignedResiduals:
 
 def is_misfit(result: CalibrationResult) -> bool:
     """Whether the noise that explains the residuals is no noise of a robot and a camera, or most motions contradict."""
-    levels = {name: result.nuisances.get(name, {}).get("value") for name in TOO_NOISY}
-    if any(value is not None and value > TOO_NOISY[name] for name, value in levels.items()):
+    levels = {name: result.nuisance(name) for name in TOO_NOISY}
+    if any(value > TOO_NOISY[name] for name, value in levels.items()):
         return True
     contradicting = sum(reason in _CONTRADICTS for reason in result.motions.reasons)
     return contradicting > int(result.motions.used.sum())

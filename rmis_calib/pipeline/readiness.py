@@ -184,9 +184,9 @@ def _expected(run: CalibrationRun, config: CalibrationConfig) -> tuple[Finding, 
     is_new = torch.as_tensor(~np.isin(all_poses.frames[spread], run.poses.frames), device=gain.device)
     covariance = inverse(solution.posterior.information[0] + gain[visible & is_new].sum(0))[None, :6, :6]
     state, flags = solution.posterior.state, solution.observability.degeneracy
-    seen = assess(problem, state.R, state.t, covariance, config.solver.verdict, flags).describe()
+    seen = assess(problem, state.R, state.t, covariance, config.solver.verdict, flags)
     in_view = f"the shaft in view in {int(visible.sum())} of {len(spread)} motions"
-    sigma = (seen.working_point_sigma_mm, seen.rotation_sigma_deg)
-    doubtful = seen.verdict is not Verdict.TRUSTWORTHY
-    sentence = f"{seen.sentence}; {in_view}. Predicted for encoders without constant offsets."
+    sigma = (float(seen.working_point_sigma_mm[0]), float(seen.rotation_sigma_deg[0]))
+    doubtful = Verdict.of(seen.verdict[0]) is not Verdict.TRUSTWORTHY
+    sentence = f"{seen.describe().sentences[0]}; {in_view}. Predicted for encoders without constant offsets."
     return Finding("expected", sentence, doubtful), sigma

@@ -1,6 +1,6 @@
 """The solver's tensors turned into a result with frames, units and a status."""
 
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -8,9 +8,7 @@ import torch
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.geometry.rigid import RigidTransform
 from rmis_calib.io import Recording
-from rmis_calib.pipeline.association import (
-    Choice,
-)
+from rmis_calib.pipeline.association import Choice
 from rmis_calib.pipeline.detection import View
 from rmis_calib.pipeline.observations import reasons_for
 from rmis_calib.pipeline.poses import MotionPoses
@@ -20,12 +18,18 @@ from rmis_calib.results import (
     JOINT_OFFSET,
     STATUS_SENTENCES,
     CalibrationResult,
+    Change,
+    Consistency,
+    GroupShift,
     Information,
     Motions,
+    Nuisance,
+    Residual,
+    Shift,
     Status,
 )
 from rmis_calib.robot import split_joint_column
-from rmis_calib.solver import Solution, SolveStatus
+from rmis_calib.solver import Solution, SolveStatus, Verdict
 from rmis_calib.solver.observability import Observability
 from rmis_calib.solver.solution import CHANGED, GroupCheck
 from rmis_calib.solver.status import MotionReason
@@ -47,7 +51,7 @@ TOO_FAR_SIGMA = 4.0
 def make_result(
     solution: Solution,
     motions: Motions,
-    residuals: dict[str, dict[str, Any]],
+    residuals: dict[str, Residual],
     config: CalibrationConfig,
     joint_columns: tuple[str, ...] = (),
     notes: tuple[str, ...] = (),
@@ -55,7 +59,15 @@ def make_result(
     """The result of one solve (no trial batch); `joint_columns` name its joint offsets, `notes` join what is said of
     the data."""
     status, message = judge(solution)
-    consistency = consistency_record(solution)
+    consistency = consistency_of(solution)
+    observability = solution.observability.describe()
+    notes = (
+        *notes,
+        *_about_tool(solution),
+        *_about_ends(solution),
+        *about_groups(consistency),
+        *about_cameras(solution),
+    )
     finite = bool(torch.isfinite(solution.camera_right_T_arm).all())
     covariance = solution.covariance.cpu().numpy()
     stereo = solution.camera_left_T_camera_right
@@ -66,19 +78,10 @@ def make_result(
         camera_right_T_arm=_transform("camera_right", "arm", solution.camera_right_T_arm) if finite else None,
         camera_left_T_camera_right=None if stereo is None else _transform("camera_left", "camera_right", stereo),
         covariance=covariance if np.isfinite(covariance).all() else None,
-        observability=observability_record(
-            solution.observability.describe(),
-            (
-                *notes,
-                *_about_tool(solution),
-                *_about_ends(solution),
-                *about_groups(consistency),
-                *about_cameras(solution),
-            ),
-        ),
+        observability=replace(observability, sentences=(*observability.sentences, *notes)),
         motions=motions,
         residuals=residuals,
-        nuisances=_nuisance_records(solution, joint_columns),
+        nuisances=_nuisances(solution, joint_columns),
         consistency=consistency,
         information=_information(solution),
         config=config.to_dict(),
@@ -116,7 +119,7 @@ def _about_ends(solution: Solution) -> tuple[str, ...]:
 def judge(solution: Solution) -> tuple[Status, str]:
     """Status and its one line: a solve that did not work first, then a model that does not fit, then sight."""
     status = SolveStatus(int(solution.status))
-    observability = solution.observability.describe()
+    verdict = Verdict.of(solution.observability.verdict[0])
     strange = _strange_unknown(solution)
     if status is not SolveStatus.CONVERGED:
         why = f"{STATUS_SENTENCES['solver_failed']}: {status.sentence}"
@@ -125,9 +128,8 @@ def judge(solution: Solution) -> tuple[Status, str]:
         return "weak", f"{STATUS_SENTENCES['weak']}: {strange}"
     if solution.groups is not None and bool(solution.groups.contradicts):
         return "weak", f"Parts of the data contradict each other: {_contradiction(solution.groups)}"
-    names: dict[str, Status] = {"trustworthy": "ok", "weak": "weak", "unobservable": "unobservable"}
-    name = names[observability.verdict.value]
-    return name, f"{STATUS_SENTENCES[name]}: {observability.sentence}"
+    name: Status = "ok" if verdict is Verdict.TRUSTWORTHY else verdict.value
+    return name, f"{STATUS_SENTENCES[name]}: {solution.observability.describe().sentences[0]}"
 
 
 def _strange_unknown(solution: Solution) -> str:
@@ -154,10 +156,10 @@ def used_motions(solution: Solution) -> tuple[np.ndarray, tuple[str, ...]]:
     return used, tuple("" if code is MotionReason.USED else code.sentence for code in codes)
 
 
-def residuals_normalised(solution: Solution, used: np.ndarray) -> dict[str, dict[str, Any]]:
+def residuals_normalised(solution: Solution, used: np.ndarray) -> dict[str, Residual]:
     """Residuals per kind and camera in normalised image units, for observations without a camera."""
     return {
-        name: residual_record(by_motion, "1e-3 of the focal length", used)
+        name: residual_of(by_motion, "1e-3 of the focal length", used)
         for name, by_motion in residual_arrays(solution, 1e3, 1e3).items()
     }
 
@@ -174,31 +176,17 @@ def residual_arrays(solution: Solution, scale_right: float, scale_left: float) -
     return arrays
 
 
-def residual_record(by_motion: np.ndarray, unit: str, used: np.ndarray) -> dict[str, Any]:
+def residual_of(by_motion: np.ndarray, unit: str, used: np.ndarray) -> Residual:
     """Median and root mean square over the used motions, with the value of every motion that was measured."""
     known = by_motion[np.isfinite(by_motion) & used]
     median = float(np.median(known)) if len(known) else None
     rms = float(np.sqrt(np.mean(known**2))) if len(known) else None
-    return {"unit": unit, "median": median, "rms": rms, "by_motion": by_motion}
+    return Residual(unit, median, rms, by_motion)
 
 
-def observability_record(observability: Observability, notes: tuple[str, ...] = ()) -> dict[str, Any]:
-    """What the data can and cannot see, as plain values."""
-    return {
-        "verdict": observability.verdict.value,
-        "sentences": [observability.sentence, *notes],
-        "working_point_mm": list(observability.working_point_mm),
-        "working_point_sigma_mm": observability.working_point_sigma_mm,
-        "directions": [
-            {"sigma_at_working_point_mm": sigma, "words": words} for sigma, words in observability.directions
-        ],
-        "named_cases": list(observability.degeneracies),
-    }
-
-
-def _nuisance_records(solution: Solution, joint_columns: tuple[str, ...]) -> dict[str, dict[str, Any]]:
+def _nuisances(solution: Solution, joint_columns: tuple[str, ...]) -> dict[str, Nuisance]:
     """Every other unknown with its sigma, and the noise levels that were used."""
-    records: dict[str, dict[str, Any]] = {}
+    found: dict[str, Nuisance] = {}
     for name, nuisance in solution.nuisances.items():
         values, sigmas, held = (item.reshape(-1).tolist() for item in (nuisance.value, nuisance.sigma, nuisance.held))
         for index, (value, sigma, is_held) in enumerate(zip(values, sigmas, held, strict=True)):
@@ -210,56 +198,48 @@ def _nuisance_records(solution: Solution, joint_columns: tuple[str, ...]) -> dic
             if name == "joint_offset":
                 joint, unit = split_joint_column(joint_columns[index])
                 key = f"{JOINT_OFFSET}{joint}"
-            records[key] = {"value": value, "sigma": sigma, "unit": unit, "held": is_held}
+            found[key] = Nuisance(value, sigma, unit, is_held)
     for name, level in solution.noise.items():
-        records[f"noise {name}"] = {"value": float(level), "sigma": None, "unit": _noise_unit(name)}
-    return records
+        found[f"noise {name}"] = Nuisance(float(level), None, _noise_unit(name))
+    return found
 
 
-def consistency_record(solution: Solution) -> dict[str, Any] | None:
-    """Groups of neighbouring motions and halves against each other, as plain values; None without groups."""
+def consistency_of(solution: Solution) -> Consistency | None:
+    """Groups of neighbouring motions and halves against each other; None without groups."""
     groups = solution.groups
     if groups is None or groups.count == 0 or bool((groups.group < 0).all()):
         return None
-    shifts, numbers = groups.shift[0].cpu(), groups.group.reshape(-1).cpu()
-    return {
-        "inflation": float(groups.inflation),
-        "group_by_motion": numbers.tolist(),
-        "groups": [
-            {
-                "motions": int((numbers == k).sum()),
-                "rotation_deg": float(torch.rad2deg(shifts[k, :3].norm())),
-                "translation_mm": float(shifts[k, 3:].norm()),
-                "sigmas": float(groups.sigmas[0, k]),
-            }
-            for k in range(groups.count)
-        ],
-        "halves": {
-            "rotation_deg": float(torch.rad2deg(groups.halves[0, :3].norm())),
-            "translation_mm": float(groups.halves[0, 3:].norm()),
-            "sigmas": float(groups.halves_sigmas),
-        },
-        "change": {
-            "before_motion": int(groups.change_at),
-            "rotation_deg": float(torch.rad2deg(groups.change[0, :3].norm())),
-            "translation_mm": float(groups.change[0, 3:].norm()),
-            "sigmas": float(groups.change_sigmas),
-        },
-    }
+    numbers = groups.group.reshape(-1).cpu().numpy()
+    sizes = np.bincount(numbers[numbers >= 0], minlength=groups.count).tolist()
+    without = [
+        GroupShift(*_size(shift), sigmas, motions=motions)
+        for shift, sigmas, motions in zip(groups.shift[0], groups.sigmas[0].tolist(), sizes, strict=True)
+    ]
+    return Consistency(
+        inflation=float(groups.inflation),
+        group_by_motion=numbers,
+        groups=tuple(without),
+        halves=Shift(*_size(groups.halves[0]), float(groups.halves_sigmas)),
+        change=Change(*_size(groups.change[0]), float(groups.change_sigmas), before_motion=int(groups.change_at)),
+    )
 
 
-def about_groups(consistency: dict[str, Any] | None) -> tuple[str, ...]:
+def _size(shift: torch.Tensor) -> tuple[float, float]:
+    """Angle in degrees and distance in mm of a (6,) difference of two transforms."""
+    return float(torch.rad2deg(shift[:3].norm())), float(shift[3:].norm())
+
+
+def about_groups(consistency: Consistency | None) -> tuple[str, ...]:
     """Whether parts of the data disagree by more than noise, in words."""
-    if consistency is None or consistency["inflation"] < WORTH_SAYING:
+    if consistency is None or (consistency.inflation or 1.0) < WORTH_SAYING:
         return ()
-    worst = max(range(len(consistency["groups"])), key=lambda k: consistency["groups"][k]["sigmas"])
-    group = consistency["groups"][worst]
-    motions = [i for i, k in enumerate(consistency["group_by_motion"]) if k == worst]
-    where, grown = ranges_in_words(motions), consistency["inflation"]
+    worst = int(np.argmax([group.sigmas or 0.0 for group in consistency.groups]))
+    group = consistency.groups[worst]
+    where = ranges_in_words(np.flatnonzero(consistency.group_by_motion == worst).tolist())
     return (
         "Groups of neighbouring motions disagree by more than noise explains, so every sigma counts "
-        f"{grown:.1f} times. Most of all the {group['motions']} motions {where}: without them the answer moves by "
-        f"{group['rotation_deg']:.2g} deg, {group['translation_mm']:.2g} mm.",
+        f"{consistency.inflation:.1f} times. Most of all the {group.motions} motions {where}: without them the answer "
+        f"moves by {group.rotation_deg:.2g} deg, {group.translation_mm:.2g} mm.",
     )
 
 
@@ -300,7 +280,8 @@ def _contradiction(groups: GroupCheck) -> str:
 
 
 def _apart(gap: torch.Tensor) -> str:
-    return f"{float(torch.rad2deg(gap[:3].norm())):.2g} deg, {float(gap[3:].norm()):.2g} mm"
+    rotation_deg, translation_mm = _size(gap)
+    return f"{rotation_deg:.2g} deg, {translation_mm:.2g} mm"
 
 
 def _information(solution: Solution) -> Information | None:
@@ -363,20 +344,18 @@ def motions_of(
     return Motions(used, tuple(reasons), recording.frame_times_s)
 
 
-def residuals_px(
-    recording: Recording, poses: MotionPoses, solution: Solution, used: np.ndarray
-) -> dict[str, dict[str, Any]]:
+def residuals_px(recording: Recording, poses: MotionPoses, solution: Solution, used: np.ndarray) -> dict[str, Residual]:
     """Residuals of each kind and camera in pixels, by frame."""
     left = recording.stereo.left
     arrays = residual_arrays(
         solution, float(recording.stereo.right.focal), float(left.focal) if left is not None else 1.0
     )
-    records = {}
+    found = {}
     for name, by_motion in arrays.items():
         by_frame = np.full(recording.n_frames, np.nan)
         by_frame[poses.frames] = by_motion
-        records[name] = residual_record(by_frame, "px", used)
-    return records
+        found[name] = residual_of(by_frame, "px", used)
+    return found
 
 
 def insufficient_data(config: CalibrationConfig, motions: Motions, why: str) -> CalibrationResult:
@@ -388,7 +367,7 @@ def insufficient_data(config: CalibrationConfig, motions: Motions, why: str) -> 
         camera_right_T_arm=None,
         camera_left_T_camera_right=None,
         covariance=None,
-        observability={"verdict": "unobservable", "sentences": [why]},
+        observability=Observability(Verdict.UNOBSERVABLE, (why,)),
         motions=motions,
         config=config.to_dict(),
     )

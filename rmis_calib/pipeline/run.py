@@ -56,19 +56,18 @@ class CalibrationRun:
         if camera_T_arm is None:
             return None
         return predict_contours(
-            camera_T_arm, self.poses, self._estimated("radius", self.recording.shaft_diameter_mm / 2)
+            camera_T_arm, self.poses, self.result.nuisance("radius", self.recording.shaft_diameter_mm / 2)
         )
 
     def predicted_ends(self, view: View) -> Float[Tensor, "m 3"] | None:
         """Where the result puts the shaft's end, mm, in one view's camera."""
         camera_T_arm = self._camera_T_arm(view)
         return (
-            None if camera_T_arm is None else predict_ends(camera_T_arm, self.poses, self._estimated("end_offset", 0.0))
+            None
+            if camera_T_arm is None
+            else predict_ends(camera_T_arm, self.poses, self.result.nuisance("end_offset", 0.0))
         )
 
     def _camera_T_arm(self, view: View) -> Float[Tensor, "4 4"] | None:
         transform = self.result.camera_right_T_arm if view.side == "right" else self.result.camera_left_T_arm
         return None if transform is None else transform.matrix.to(self.poses.arm_T_rcm.device)
-
-    def _estimated(self, name: str, otherwise: float) -> float:
-        return float(self.result.nuisances.get(name, {"value": otherwise})["value"])

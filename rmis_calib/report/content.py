@@ -2,36 +2,37 @@
 
 import json
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from rmis_calib.geometry.rigid import RigidTransform
-from rmis_calib.report.formatting import UNKNOWN, any_value, finite, fixed, significant
-from rmis_calib.results import STATUS_SENTENCES, CalibrationResult, finite_or_none
+from rmis_calib.io.plain_values import finite_or_none
+from rmis_calib.report.formatting import UNKNOWN, finite, fixed, significant
+from rmis_calib.results import STATUS_SENTENCES, CalibrationResult
+from rmis_calib.solver.observability import Direction, Observability, Verdict
 
 AXES = ("x, right", "y, down", "z, forward")
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """The first thing to read: `tone` is `ok`, `weak` or `bad`, and chooses colour and icon together."""
+class Headline:
+    """The verdict, the first thing to read: `tone` is `ok`, `weak` or `bad`, and chooses colour and icon together."""
 
     tone: str
     word: str
     sentence: str
 
 
-_VERDICTS = {
+_HEADLINES = {
     "ok": ("ok", "Trustworthy"),
     "weak": ("weak", "Weak: do not rely on it"),
     "unobservable": ("bad", "Not observable: do not use"),
     "solver_failed": ("bad", "No solution"),
     "insufficient_data": ("bad", "Not enough data"),
 }
-_OBSERVABILITY_TONES = {"trustworthy": "ok", "weak": "weak", "unobservable": "bad"}
+_TONES = {Verdict.TRUSTWORTHY: "ok", Verdict.WEAK: "weak", Verdict.UNOBSERVABLE: "bad", None: "open"}
 
 
 @dataclass(frozen=True)
@@ -77,17 +78,16 @@ class Uncertainty:
 
 
 @dataclass(frozen=True)
-class Direction:
-    """One eigen-direction of the uncertainty: words, sigma, length of its bar in per cent, and its six components."""
+class DirectionRow:
+    """One eigen-direction of the uncertainty: words, sigma, and length of its bar in per cent."""
 
     words: str
     sigma_mm: str
     bar_percent: float
-    vector: str
 
 
 @dataclass(frozen=True)
-class Observability:
+class ObservabilityPart:
     """What the data can and cannot see; `ticks` are (place in per cent, label) of the bars' logarithmic axis."""
 
     tone: str
@@ -95,7 +95,7 @@ class Observability:
     sentences: tuple[str, ...]
     named_cases: tuple[str, ...]
     advice: tuple[str, ...]
-    directions: tuple[Direction, ...]
+    directions: tuple[DirectionRow, ...]
     ticks: tuple[tuple[float, str], ...]
 
 
@@ -109,10 +109,9 @@ class Row:
     unit: str
 
 
-def verdict(result: CalibrationResult) -> Verdict:
-    """The verdict in a word and a sentence; a status this page does not know counts as bad."""
-    tone, word = _VERDICTS.get(result.status, ("bad", f"Unknown status {result.status}"))
-    return Verdict(tone, word, STATUS_SENTENCES.get(result.status, ""))
+def headline(result: CalibrationResult) -> Headline:
+    """The verdict in a word and a sentence."""
+    return Headline(*_HEADLINES[result.status], STATUS_SENTENCES[result.status])
 
 
 def pose(name: str, transform: RigidTransform | None) -> Pose | None:
@@ -155,7 +154,7 @@ def uncertainty(result: CalibrationResult) -> Uncertainty:
     return Uncertainty(
         rotation_deg=significant(math.sqrt(np.sum(degrees**2)), 2),
         translation_mm=significant(math.sqrt(np.sum(variances[3:])), 2),
-        working_point_mm=significant(result.observability.get("working_point_sigma_mm"), 2),
+        working_point_mm=significant(result.observability.working_point_sigma_mm, 2),
         axes=tuple(
             AxisRow(axis, significant(degrees[index], 2), significant(sigmas[3 + index], 2))
             for index, axis in enumerate(AXES)
@@ -163,37 +162,36 @@ def uncertainty(result: CalibrationResult) -> Uncertainty:
     )
 
 
-def observability(raw: Mapping[str, Any]) -> Observability:
-    """Observability in print, tolerant of missing keys; weakest direction first."""
-    found = [item for item in raw.get("directions") or () if isinstance(item, Mapping)]
-    sigmas = [finite(item.get("sigma_at_working_point_mm")) for item in found]
-    size = [math.inf if sigma is None else sigma for sigma in sigmas]
-    order = sorted(range(len(found)), key=lambda index: -size[index])
-    known = [sigma for sigma in sigmas if sigma is not None and sigma > 0.0]
+def observability(seen: Observability) -> ObservabilityPart:
+    """Observability in print; weakest direction first."""
+    found = sorted(seen.directions, key=_size, reverse=True)
+    known = [sigma for item in found if (sigma := item.sigma_at_working_point_mm)]
     low = math.floor(math.log10(min(known))) if known else -2
     high = min(max(math.ceil(math.log10(max(known))), low + 1), low + 9) if known else 2
-    verdict_word = str(raw.get("verdict") or "not assessed")
-    return Observability(
-        tone=_OBSERVABILITY_TONES.get(verdict_word, "open"),
-        verdict=verdict_word,
-        sentences=_texts(raw.get("sentences")),
-        named_cases=tuple(name.replace("_", " ").lower() for name in _texts(raw.get("named_cases"))),
-        advice=_texts(raw.get("advice")),
-        directions=tuple(_direction(found[index], sigmas[index], low, high) for index in order),
+    return ObservabilityPart(
+        tone=_TONES[seen.verdict],
+        verdict=seen.verdict or "not assessed",
+        sentences=seen.sentences,
+        named_cases=tuple(name.replace("_", " ").lower() for name in seen.named_cases),
+        advice=seen.advice,
+        directions=tuple(_direction(item, low, high) for item in found),
         ticks=tuple((100.0 * (power - low) / (high - low), f"{10.0**power:g}") for power in _decades(low, high)),
     )
 
 
-def _direction(raw: Mapping[str, Any], sigma: float | None, low: int, high: int) -> Direction:
-    percent = 100.0
+def _size(direction: Direction) -> float:
+    sigma = direction.sigma_at_working_point_mm
+    return math.inf if sigma is None else sigma
+
+
+def _direction(item: Direction, low: int, high: int) -> DirectionRow:
+    sigma, percent = item.sigma_at_working_point_mm, 100.0
     if sigma is not None:
         percent = 0.0 if sigma <= 0.0 else 100.0 * (math.log10(sigma) - low) / (high - low)
-    vector = raw.get("vector")
-    return Direction(
-        words=str(raw.get("words") or "not described"),
+    return DirectionRow(
+        words=item.words,
         sigma_mm="not bounded" if sigma is None else f"{significant(sigma, 2)} mm",
         bar_percent=round(min(max(percent, 0.5), 100.0), 2),
-        vector="" if vector is None else "  ".join(fixed(component, 3) for component in vector),
     )
 
 
@@ -201,22 +199,12 @@ def _decades(low: int, high: int) -> range:
     return range(low, high + 1, 1 if high - low <= 5 else 2)
 
 
-def _texts(value: Any) -> tuple[str, ...]:
-    if value is None:
-        return ()
-    return (value,) if isinstance(value, str) else tuple(str(item) for item in value)
-
-
 def nuisances(result: CalibrationResult) -> tuple[Row, ...]:
     """Everything else that was estimated or assumed, with its sigma."""
     return tuple(
-        Row(name, any_value(entry.get("value")), _sigma(entry.get("sigma")), str(entry.get("unit") or ""))
+        Row(name, significant(entry.value, 4), "" if entry.sigma is None else significant(entry.sigma, 2), entry.unit)
         for name, entry in result.nuisances.items()
     )
-
-
-def _sigma(value: Any) -> str:
-    return "" if value is None else any_value(value, 2)
 
 
 def head_point_errors(result: CalibrationResult) -> tuple[tuple[str, ...], ...]:
@@ -225,10 +213,10 @@ def head_point_errors(result: CalibrationResult) -> tuple[tuple[str, ...], ...]:
     return tuple(
         (
             camera,
-            *(significant(entry.get(key)) for key in ("median", "rms", "max")),
-            any_value(entry.get("count")),
+            *(significant(distance) for distance in (error.median, error.rms, error.max)),
+            str(error.count),
         )
-        for camera, entry in errors.items()
+        for camera, error in errors.items()
     )
 
 

@@ -1,13 +1,12 @@
 """What the result rests on: the motions used and rejected, and the residuals of each kind of measurement."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from rmis_calib.report.formatting import finite, significant
 from rmis_calib.report.plots import ResidualPlots, plot_residuals
-from rmis_calib.results import CalibrationResult, Motions
+from rmis_calib.results import CalibrationResult, Motions, Residual
 
 # One mark a motion up to here: about 1.5 px each on a phone. Beyond, a mark stands for several consecutive motions.
 _MAX_MARKS = 240
@@ -65,7 +64,7 @@ class Usage:
 
 
 @dataclass(frozen=True)
-class Residual:
+class ResidualPart:
     """Residuals of one kind of measurement; without `plots` when nothing finite was measured."""
 
     title: str
@@ -120,30 +119,27 @@ def _percent(part: int, whole: int) -> float:
     return round(100.0 * part / whole, 2) if whole else 0.0
 
 
-def residuals(result: CalibrationResult) -> tuple[Residual, ...]:
+def residuals(result: CalibrationResult) -> tuple[ResidualPart, ...]:
     """Each kind of residual, in the order of the result."""
     return tuple(_residual(kind, entry, result.motions) for kind, entry in result.residuals.items())
 
 
-def _residual(kind: str, entry: dict[str, Any], motions: Motions) -> Residual:
+def _residual(kind: str, entry: Residual, motions: Motions) -> ResidualPart:
     measurement, _, camera = kind.rpartition("_")
     known = measurement in _MEASUREMENTS and camera in ("right", "left")
     title = f"{_MEASUREMENTS[measurement]}, {camera} camera" if known else kind
-    unit = str(entry.get("unit") or "no unit given")
-    raw = entry.get("by_motion")
-    numbers = (finite(value) for value in (() if raw is None else raw))
-    values = np.array([np.nan if number is None else number for number in numbers])
+    unit, values = entry.unit, entry.by_motion
     used = np.asarray(motions.used, dtype=bool)
     used = used if len(used) == len(values) else np.ones(len(values), dtype=bool)
     measured = np.isfinite(values)
     plots = plot_residuals(values, used, unit, camera if known else "other", title) if measured.any() else None
-    return Residual(
+    return ResidualPart(
         title=title,
         meaning=_MEASUREMENT_WORDS[measurement] if known else "",
         unit=unit,
         count=int((measured & used).sum()),
-        median=significant(entry.get("median")),
-        rms=significant(entry.get("rms")),
+        median=significant(entry.median),
+        rms=significant(entry.rms),
         robust_scale=significant(None if plots is None else plots.robust_scale),
         largest=significant(np.abs(values[measured]).max() if measured.any() else None),
         plots=plots,

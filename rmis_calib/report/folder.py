@@ -9,6 +9,7 @@ import torch
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.io import RecordingDescription, atomic_directory, load_recording
 from rmis_calib.io.atomic import write_yaml
+from rmis_calib.io.plain_values import finite_or_none
 from rmis_calib.pipeline.calibration import run_calibration
 from rmis_calib.pipeline.detection import DetectionTable, Progress, View, no_progress
 from rmis_calib.pipeline.run import CalibrationRun
@@ -16,7 +17,7 @@ from rmis_calib.report.detection_pictures import write_picture
 from rmis_calib.report.overlay_video import write_overlay_videos
 from rmis_calib.report.page import write_report
 from rmis_calib.report.pictures import overlays, spread
-from rmis_calib.results import CalibrationResult, finite_or_none
+from rmis_calib.results import CalibrationResult
 from rmis_calib.vision import FrameReason
 
 REPORT_PICTURES = 12

@@ -1,7 +1,6 @@
 """Numbers as a reader wants them: significant digits, real minus signs, and a word for what is not known."""
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 UNKNOWN = "unknown"
@@ -35,14 +34,3 @@ def fixed(value: Any, decimals: int) -> str:
         return UNKNOWN
     text = f"{number:.{decimals}f}"
     return f"{0.0:.{decimals}f}" if float(text) == 0.0 else text
-
-
-def any_value(value: Any, digits: int = 4) -> str:
-    """A number, a sequence of numbers, or text, for tables whose values have no fixed kind."""
-    if value is None:
-        return UNKNOWN
-    if isinstance(value, (bool, int, str)):
-        return str(value)
-    if isinstance(value, Sequence) or getattr(value, "ndim", 0):
-        return ", ".join(any_value(item, digits) for item in value)
-    return significant(value, digits)

@@ -78,12 +78,11 @@ def _strip(overlay: Overlay, result: CalibrationResult, height: int) -> np.ndarr
     width = overlay.image.shape[1]
     strip = np.full((height, width, 3), _PLATE, np.uint8)
     half, margin = height // 2, max(6, width // 80)
-    residual = result.residuals.get(f"contour_{overlay.camera}", {}).get("by_motion")
-    value = np.nan if residual is None else float(residual[overlay.frame])
+    value = result.residual(f"contour_{overlay.camera}", overlay.frame)
     tone = _TONES.get(result.status, _BAD)
     _write(strip, f"frame {overlay.frame}: {overlay.caption}", (margin, half), half, _INK if overlay.used else _QUIET)
     _write(strip, f"{result.status}: {result.message}", (margin, height), half, tone)
-    if np.isfinite(value):
+    if value is not None:
         length = round(0.25 * width)
         left, top, bottom = width - margin - length, round(0.3 * half), round(0.75 * half)
         cv2.rectangle(strip, (left, top), (width - margin, bottom), _QUIET, 1)

@@ -73,7 +73,7 @@ def render_report(
         notes=notes,
         result=result,
         created=content.created(result),
-        verdict=content.verdict(result),
+        verdict=content.headline(result),
         right=content.pose("camera_right_T_arm", result.camera_right_T_arm),
         left=content.pose("camera_left_T_arm", result.camera_left_T_arm),
         uncertainty=content.uncertainty(result),

@@ -80,9 +80,8 @@ def _overlay(
 def _caption(result: CalibrationResult, side: str, frame: int) -> str:
     """Why the motion was not used, or how far its contours are from the prediction."""
     reason = result.motions.reasons[frame]
-    residual = result.residuals.get(f"contour_{side}", {"by_motion": {frame: np.nan}})["by_motion"][frame]
-    distance = f"contours {residual:.2f} px from the prediction" if np.isfinite(residual) else "not measured here"
-    return reason or distance
+    px = result.residual(f"contour_{side}", frame)
+    return reason or ("not measured here" if px is None else f"contours {px:.2f} px from the prediction")
 
 
 def contour_polylines(contour_n: Float[Tensor, "2 3"], camera: Camera) -> Float[np.ndarray, "2 p 2"]:

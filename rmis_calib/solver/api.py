@@ -21,7 +21,7 @@ from rmis_calib.solver.estimate.map_estimate import map_estimate
 from rmis_calib.solver.estimate.relinearise import Kinematics, solve_relinearised
 from rmis_calib.solver.model.measurement_rows import pack
 from rmis_calib.solver.problem import MIN_MOTIONS, Problem
-from rmis_calib.solver.settings import SolverSettings
+from rmis_calib.solver.settings import Method, SolverSettings
 from rmis_calib.solver.solution import AlternativeModel, Solution, concatenate, map_tensors
 from rmis_calib.solver.start.candidates import best_candidate
 from rmis_calib.solver.start.line_statistics import LineStatistics
@@ -36,7 +36,7 @@ cache, and in which nobody waits for a trial that takes more steps."""
 def solve(
     problem: Problem,
     settings: SolverSettings | None = None,
-    method: str | None = None,
+    method: Method | None = None,
     kinematics: Kinematics | None = None,
     alternative: AlternativeModel | None = None,
     differentiable: bool = False,
@@ -74,7 +74,7 @@ def solve(
 def _solve_groups(
     flat: Problem,
     settings: SolverSettings,
-    method: str,
+    method: Method,
     kinematics: Kinematics | None,
     alternative: AlternativeModel | None,
 ) -> Solution:
@@ -93,7 +93,7 @@ def _solve_groups(
 def _solve_flat(
     flat: Problem,
     settings: SolverSettings,
-    method: str,
+    method: Method,
     kinematics: Kinematics | None = None,
     alternative: AlternativeModel | None = None,
 ) -> Solution:
@@ -115,7 +115,7 @@ def _solve_flat(
     return solution if index is None else replace(_spread(solution, index, flat.n_motions), information_kept=kept)
 
 
-def _solve_two_step(flat: Problem, settings: SolverSettings, method: str) -> Solution:
+def _solve_two_step(flat: Problem, settings: SolverSettings, method: Method) -> Solution:
     """`paper` and `global`."""
     R, t, covariance = _two_step_estimate(flat, settings, method)
     with torch.no_grad():

@@ -9,7 +9,11 @@ from enum import IntFlag, StrEnum
 
 import torch
 from jaxtyping import Float, Int
+from pydantic import model_serializer
+from pydantic.dataclasses import dataclass as pydantic_dataclass
 from torch import Tensor
+
+from rmis_calib.io.plain_values import FILE_PART, Number
 
 NEAR_AXIS_COS = 0.8
 """Cosine from which a direction is called by the name of an axis (37 degrees)."""
@@ -22,9 +26,15 @@ class Verdict(StrEnum):
     WEAK = "weak"
     UNOBSERVABLE = "unobservable"
 
+    @property
+    def code(self) -> int:
+        """What stands for it in tensors: the worse, the larger."""
+        return list(Verdict).index(self)
 
-VERDICTS = (Verdict.TRUSTWORTHY, Verdict.WEAK, Verdict.UNOBSERVABLE)
-"""By their code in `ObservabilityTensors.verdict`."""
+    @classmethod
+    def of(cls, code: Int[Tensor, ""]) -> "Verdict":
+        """The verdict that a code in a tensor stands for."""
+        return list(cls)[int(code)]
 
 
 class Degeneracy(IntFlag):
@@ -62,27 +72,62 @@ _REMEDIES = {
 }
 
 
-@dataclass(frozen=True)
+@pydantic_dataclass(frozen=True, config=FILE_PART)
+class Direction:
+    """A principal direction of the transform's uncertainty."""
+
+    sigma_at_working_point_mm: Number
+    """1 sigma along it, mm at the working point; null where it is not bounded."""
+    words: str
+    """What it is: a rotation or a translation, and about or along what."""
+
+
+@pydantic_dataclass(frozen=True, config=FILE_PART)
+class NextMotion:
+    """A further motion that is advised, and what it would gain together with those before it."""
+
+    words: str
+    """What to do."""
+    joints: dict[str, float] | None
+    """Readings to move to by column (`<arm>.<joint>_rad` or `_mm`); null where no joints are known."""
+    weakest_sigma_mm: Number
+    """Predicted 1 sigma of the weakest direction, mm at the working point."""
+    working_point_sigma_mm: Number
+    """Predicted error at the working point, mm, root of the trace."""
+
+
+_ASSESSED = ("working_point_mm", "working_point_sigma_mm", "directions", "named_cases")
+_ADVISED = ("advice", "next_motions")
+
+
+@pydantic_dataclass(frozen=True, config=FILE_PART)
 class Observability:
-    """What the data can see, for one trial.
+    """What the data can and cannot see of the transform. What was not assessed, or not advised, is absent in a file."""
 
-    Attributes:
-        verdict: from the predicted errors and the thresholds of the settings.
-        working_point_mm: where the error counts, in `camera_right`.
-        working_point_sigma_mm: predicted error there, root of the trace.
-        rotation_sigma_deg: predicted rotation error, root of the trace.
-        directions: the principal directions, worst first: (1 sigma in mm at the working point, sentence).
-        degeneracies: names of the classical degenerate cases that were recognised.
-        sentence: one line for a report.
-    """
+    verdict: Verdict | None = None
+    """Whether the predicted errors are small enough to use the result; null where they were not assessed."""
+    sentences: tuple[str, ...] = ()
+    """What the data can and cannot see, in words, most important first."""
+    working_point_mm: tuple[Number, Number, Number] | None = None
+    """Where the error counts: a point in `camera_right`, mm."""
+    working_point_sigma_mm: Number = None
+    """Predicted error there, mm: root of the trace of its covariance."""
+    directions: tuple[Direction, ...] = ()
+    """The principal directions of the uncertainty, worst first."""
+    named_cases: tuple[str, ...] = ()
+    """Names of the classical degenerate cases that were recognised."""
+    advice: tuple[str, ...] = ()
+    """What to record next, in words; absent where none is wanted or none can be predicted."""
+    next_motions: tuple[NextMotion, ...] = ()
+    """The same as values, in their order."""
 
-    verdict: Verdict
-    working_point_mm: tuple[float, float, float]
-    working_point_sigma_mm: float
-    rotation_sigma_deg: float
-    directions: tuple[tuple[float, str], ...]
-    degeneracies: tuple[str, ...]
-    sentence: str
+    @model_serializer(mode="wrap")
+    def _without_absent(self, plain):
+        record = plain(self)
+        for keys in (_ASSESSED, _ADVISED):
+            if not any(record[key] for key in keys):
+                record = {key: value for key, value in record.items() if key not in keys}
+        return record
 
 
 @dataclass(frozen=True)
@@ -95,7 +140,7 @@ class ObservabilityTensors:
         rotation_sigma_deg: predicted rotation error, root of the trace.
         sigma_mm: 1 sigma along the principal directions, worst first.
         directions: principal directions of (lever * dphi, displacement of the working point).
-        verdict: 0 trustworthy, 1 weak, 2 unobservable.
+        verdict: codes of `Verdict`.
         degeneracy: flags (`Degeneracy`).
         shaft_direction: mean direction of the shaft, in `camera_right`.
     """
@@ -115,13 +160,11 @@ class ObservabilityTensors:
 
     def describe(self, trial: int = 0) -> Observability:
         """One trial in words."""
-        sigma = [float(s) for s in self.sigma_mm[trial]]
         names = [_direction_name(d, self.shaft_direction[trial]) for d in self.directions[trial]]
-        verdict = VERDICTS[int(self.verdict[trial])]
+        verdict = Verdict.of(self.verdict[trial])
         flags = [flag for flag in Degeneracy if flag and int(self.degeneracy[trial]) & flag]
         reasons = [_SENTENCES[flag] for flag in flags]
         at_point, rotation = float(self.working_point_sigma_mm[trial]), float(self.rotation_sigma_deg[trial])
-        x, y, z = (float(value) for value in self.working_point_mm[trial])
         if verdict is Verdict.TRUSTWORTHY:
             sentence = f"predicted error {at_point:.2f} mm at the working point, {rotation:.2f} deg"
         else:
@@ -129,14 +172,14 @@ class ObservabilityTensors:
             size = f"{min(at_point, 9999.0):.1f} mm at the working point, {min(rotation, 180.0):.1f} deg"
             sentence = f"{names[0]} {word} (predicted error {size})"
             sentence += f": {_joined(reasons)}" if reasons else ""
+        x, y, z = self.working_point_mm[trial].tolist()
         return Observability(
             verdict=verdict,
+            sentences=(sentence,),
             working_point_mm=(x, y, z),
             working_point_sigma_mm=at_point,
-            rotation_sigma_deg=rotation,
-            directions=tuple(zip(sigma, names, strict=True)),
-            degeneracies=tuple(flag.name or "" for flag in flags),
-            sentence=sentence,
+            directions=tuple(map(Direction, self.sigma_mm[trial].tolist(), names)),
+            named_cases=tuple(flag.name or "" for flag in flags),
         )
 
 

@@ -8,6 +8,7 @@ from pydantic.dataclasses import dataclass
 Positive = Annotated[float, Field(gt=0.0)]
 NotNegative = Annotated[float, Field(ge=0.0)]
 Count = Annotated[int, Field(ge=1)]
+Method = Literal["paper", "global", "joint"]
 _STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
@@ -128,7 +129,7 @@ class AdviceSettings:
 class SolverSettings:
     """Everything the solver can be told."""
 
-    method: Literal["paper", "global", "joint"] = "joint"
+    method: Method = "joint"
     """`paper`: as published; `global`: covering grid on SO(3), then translation; `joint`: weighted estimate of
     everything."""
     unknowns: UnknownSettings = UnknownSettings()

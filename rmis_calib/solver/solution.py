@@ -11,7 +11,8 @@ from torch import Tensor
 from rmis_calib.solver.model.normal_equations import NoiseModel
 from rmis_calib.solver.model.parameters import ParameterLayout
 from rmis_calib.solver.model.state import State
-from rmis_calib.solver.observability import ObservabilityTensors
+from rmis_calib.solver.observability import ObservabilityTensors, Verdict
+from rmis_calib.solver.settings import Method
 from rmis_calib.solver.status import SolveStatus
 
 
@@ -150,7 +151,7 @@ class Solution:
         information_kept: part of the information (per parameter, geometric mean) that thinning kept; 1 without.
     """
 
-    method: str
+    method: Method
     camera_right_T_arm: Float[Tensor, "*batch 4 4"]
     camera_left_T_camera_right: Float[Tensor, "*batch 4 4"] | None
     covariance: Float[Tensor, "*batch 6 6"]
@@ -186,11 +187,12 @@ class Solution:
 
     @property
     def verdict(self) -> Int[Tensor, "*batch"]:
-        """0 trustworthy, 1 weak, 2 unobservable; a solve that did not converge is never better than unobservable."""
+        """Codes of `Verdict`; a solve that did not converge is never better than unobservable."""
         verdict = self.observability.verdict.view_as(self.status)
         if self.groups is not None:
-            verdict = torch.where(self.groups.contradicts.view_as(verdict), verdict.clamp_min(1), verdict)
-        return torch.where(self.converged, verdict, 2)
+            not_above = verdict.clamp_min(Verdict.WEAK.code)
+            verdict = torch.where(self.groups.contradicts.view_as(verdict), not_above, verdict)
+        return torch.where(self.converged, verdict, Verdict.UNOBSERVABLE.code)
 
     @property
     def converged(self) -> Bool[Tensor, "*batch"]:

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rmis_calib.io.atomic import atomic_write, write_json
-from rmis_calib.results import finite_or_none, package_versions
+from rmis_calib.io.plain_values import finite_or_none
+from rmis_calib.results import package_versions
 from rmis_calib.studies.engine import PAGE, RECORD, STUDY_FORMAT
 from rmis_calib.studies.figures import write_figure
 from rmis_calib.studies.page import Table, write_page

@@ -11,8 +11,8 @@ from markupsafe import Markup
 from rmis_calib import __version__
 from rmis_calib.io.atomic import atomic_write
 from rmis_calib.io.outputs import check_file, is_report
+from rmis_calib.io.plain_values import finite_or_none
 from rmis_calib.report.page import template
-from rmis_calib.results import finite_or_none
 from rmis_calib.studies.plots import BOUND_COLOUR, COLOURS, MARKERS, Figure
 
 

@@ -52,7 +52,7 @@ def gap(result: CalibrationResult, folder: Path) -> tuple[float, float, float]:
 def residual(result: CalibrationResult, kind: str) -> str:
     """Median of a kind, right / left, px."""
     return " / ".join(
-        f"{result.residuals[f'{kind}_{side}']['median']:.2f}"
+        f"{result.residuals[f'{kind}_{side}'].median:.2f}"
         for side in ("right", "left")
         if f"{kind}_{side}" in result.residuals
     )

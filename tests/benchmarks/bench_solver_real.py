@@ -21,7 +21,7 @@ import yaml
 from rmis_calib.cli import main as command_line
 from rmis_calib.io import ShaftObservations
 from rmis_calib.solver import Problem, SolverSettings, solve
-from rmis_calib.solver.observability import VERDICTS
+from rmis_calib.solver.observability import Verdict
 from rmis_calib.solver.settings import UnknownSettings
 from tests.benchmarks.solver_common import errors, rotation_deg, translation_mm
 
@@ -68,7 +68,7 @@ def main() -> int:
             f"{name:38} | {int((solution.reason == 0).sum()):4d} | {lines:9.2f} | "
             f"{float(head.nanmedian()):12.2f} | {degrees:8.2f} deg {mm:6.2f} mm | "
             f"{sigma_deg:6.2f} deg {sigma_mm:6.2f} mm | "
-            f"{ratio:8.2f} | {VERDICTS[int(solution.verdict)]}",
+            f"{ratio:8.2f} | {Verdict.of(solution.verdict)}",
             flush=True,
         )
     return 1 if bad else 0

@@ -2,7 +2,9 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
 
@@ -19,7 +21,7 @@ def test_demo_is_within_a_tenth_of_a_degree_and_its_own_sigmas(demo_output):
     assert evaluation.rotation_error_deg <= 0.10
     assert evaluation.translation_error_mm <= 0.3
     assert evaluation.error_sigmas <= CHI_3_SIGMA
-    assert evaluation.head_point_error_px["right"]["median"] < 2.0
+    assert evaluation.head_point_error_px["right"].median < 2.0
 
 
 @pytest.mark.slow
@@ -30,6 +32,8 @@ def test_demo_leaves_everything_a_user_looks_at(demo_output):
     result = json.loads((calibration / "result.json").read_text())
     assert result["status"] == "ok"
     assert result["motions"]["used"] >= 54
+    schema = Path(__file__).parents[2] / "docs" / "result.schema.json"
+    jsonschema.validate(result, json.loads(schema.read_text()))
     assert "ground_truth" not in (calibration / "report.html").read_text()
 
 

@@ -27,4 +27,4 @@ def test_a_marker_makes_a_weak_recording_strong():
     assert before.status != "ok" and after.status == "ok"
     assert after.translation_sigma_mm < 0.3 * before.translation_sigma_mm
     residual = after.residuals["tracked marker"]
-    assert residual["unit"] == "mm" and 0.2 < residual["rms"] < 1.0
+    assert residual.unit == "mm" and 0.2 < residual.rms < 1.0

@@ -25,7 +25,7 @@ def test_real_recording_is_calibrated(calibrated, shared_data):
     assert (code, result.status) in ((0, "ok"), (1, "weak"))
     assert int(result.motions.used.sum()) >= 40
     evaluation = rc.evaluate(result, recording, recording / "reference.yaml")
-    assert evaluation.head_point_error_px["right"]["median"] <= 8.0
+    assert evaluation.head_point_error_px["right"].median <= 8.0
     assert evaluation.rotation_error_deg <= 1.5
     assert evaluation.translation_error_mm <= 6.0
     assert evaluation.error_sigmas <= CHI_3_SIGMA

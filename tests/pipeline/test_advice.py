@@ -8,17 +8,19 @@ import numpy as np
 import pytest
 import torch
 from measured_from_truth import SMALL, observations_from_truth
+from pydantic import TypeAdapter
 
 import data_synth
 import rmis_calib as rc
 from data_synth.scene import build_scene
 from data_synth.settings import SceneSettings
 from rmis_calib.config import parse_config
-from rmis_calib.pipeline.advice import advice_record, camera_view, joint_box, joint_candidates, seen_view
+from rmis_calib.pipeline.advice import camera_view, joint_box, joint_candidates, seen_view, with_advice
 from rmis_calib.pipeline.estimation import estimate, problem_of
 from rmis_calib.pipeline.offset_unknowns import KinematicUnknowns
 from rmis_calib.pipeline.poses import motion_poses
 from rmis_calib.solver.assess.observability import assess
+from rmis_calib.solver.observability import Observability
 
 SIGMA_PX = 0.2
 CONFIG = parse_config({"edge_bias_px": 0.0, "solver": {"bias_correction": False, "advice": {"candidates": 200}}})
@@ -57,7 +59,8 @@ def advised(weak, config=CONFIG):
     used = np.ones(problem.n_motions, dtype=bool)
     candidates = joint_candidates(recording, unknowns, problem, solution, used, config.solver.advice, seed=0)
     view = camera_view(recording.stereo.right)[None]
-    return candidates, advice_record(solution, candidates, view, config, "within reach"), solution
+    seen = solution.observability.describe()
+    return candidates, with_advice(seen, solution, candidates, view, config, "within reach"), solution
 
 
 def test_motions_stay_within_reach_and_limits(weak):
@@ -77,7 +80,7 @@ def test_motions_stay_within_reach_and_limits(weak):
     assert candidates.joints is not None
     low, high = joint_box(limited, unknowns.columns, logged, settings)
     assert bool(((candidates.joints >= low - 1e-9) & (candidates.joints <= high + 1e-9)).all())
-    assert all(150.0 <= motion["joints"][name] <= 170.0 for motion in record["next_motions"])
+    assert all(150.0 <= motion.joints[name] <= 170.0 for motion in record.next_motions)
 
 
 def with_limits(recording, column, least, greatest):
@@ -96,8 +99,8 @@ def test_readings_keep_the_shaft_in_the_true_camera(weak):
     """The advised readings, put into the independent kinematics."""
     _, record, _ = advised(weak)
     scene = build_scene(SceneSettings())
-    for motion in record["next_motions"]:
-        readings = np.array(list(motion["joints"].values()))
+    for motion in record.next_motions:
+        readings = np.array(list(motion.joints.values()))
         shaft = scene.instrument.shaft(readings[3:])
         base_T_camera = scene.laparoscope.tool(readings[:3]) @ np.linalg.inv(scene.camera_right_T_arm)
         camera_T_rcm = np.linalg.inv(base_T_camera) @ shaft.base_T_rcm
@@ -110,47 +113,47 @@ def test_readings_keep_the_shaft_in_the_true_camera(weak):
 
 def test_words_name_joints_readings_and_what_is_gained(weak):
     candidates, record, solution = advised(weak)
-    first, motion = record["advice"][0], record["next_motions"][0]
-    assert solution.observability.describe().directions[0][1] in first
+    first, motion = record.advice[0], record.next_motions[0]
+    assert solution.observability.describe().directions[0].words in first
     assert candidates.joints is not None
-    index = candidates.words.index(motion["words"])
-    assert motion["words"] in first
-    assert list(motion["joints"].values()) == candidates.joints[index].tolist()
+    index = candidates.words.index(motion.words)
+    assert motion.words in first
+    assert list(motion.joints.values()) == candidates.joints[index].tolist()
     moves = re.findall(r"(laparoscope|instrument)\.(\w+) from (-?[\d.]+) to (-?[\d.]+) (deg|mm)", first)
     assert moves
     for arm, joint, _, after, unit in moves:
-        value = motion["joints"][f"{arm}.{joint}_{'mm' if unit == 'mm' else 'rad'}"]
+        value = motion.joints[f"{arm}.{joint}_{'mm' if unit == 'mm' else 'rad'}"]
         assert float(after) == pytest.approx(value if unit == "mm" else np.rad2deg(value), abs=0.06)
-    sigmas = [motion["weakest_sigma_mm"] for motion in record["next_motions"]]
-    assert sigmas[0] < 0.5 * solution.observability.describe().directions[0][0]
+    sigmas = [motion.weakest_sigma_mm for motion in record.next_motions]
+    assert sigmas[0] < 0.5 * solution.observability.describe().directions[0].sigma_at_working_point_mm
     assert sigmas == sorted(sigmas, reverse=True)
-    json.dumps(record, allow_nan=False)
+    json.dumps(TypeAdapter(Observability).dump_python(record, mode="json"), allow_nan=False)
 
 
 def test_axis_lines_of_a_still_laparoscope_need_the_laparoscope_to_move(weak):
     """Without a radius the instrument alone can never tell the translation along the view."""
     config = parse_config({"measurements": ["axis"], "solver": {"advice": {"motions": 1}}})
     _, record, solution = advised(weak, config)
-    assert "STATIC_LAPAROSCOPE" in solution.observability.describe().degeneracies
-    assert all("laparoscope." in motion["words"] for motion in record["next_motions"])
-    assert "In general: move the laparoscope's arm as well, with its joints logged." in record["advice"]
+    assert "STATIC_LAPAROSCOPE" in solution.observability.describe().named_cases
+    assert all("laparoscope." in motion.words for motion in record.next_motions)
+    assert "In general: move the laparoscope's arm as well, with its joints logged." in record.advice
 
 
 def test_an_observations_file_gets_advice_as_the_picture_shows_it(weak):
     result = rc.solve(weak[2], CONFIG, throw=False)
-    advice = result.observability["advice"]
+    advice = result.observability.advice
     assert re.search(r"(swing|insert|withdraw|turn) the (instrument|laparoscope)", advice[0])
     assert any("tells no joints" in sentence for sentence in advice)
-    assert all(motion["joints"] is None for motion in result.observability["next_motions"])
+    assert all(motion.joints is None for motion in result.observability.next_motions)
     again = type(result).from_dict(json.loads(json.dumps(result.to_dict(), allow_nan=False)))
-    assert again.observability["advice"] == advice
+    assert again.observability.advice == advice
 
 
 def test_no_advice_where_none_is_wanted_or_no_estimate_predicts(weak):
     quiet = parse_config({"edge_bias_px": 0.0, "solver": {"advice": {"motions": 0}}})
-    assert "advice" not in rc.solve(weak[2], quiet, throw=False).observability
+    assert not rc.solve(weak[2], quiet, throw=False).observability.advice
     two_step = parse_config({"solver": {"method": "global"}})
-    assert "advice" not in rc.solve(weak[2], two_step, throw=False).observability
+    assert not rc.solve(weak[2], two_step, throw=False).observability.advice
 
 
 def test_views_of_a_camera_and_of_measurements(weak):
@@ -173,7 +176,7 @@ def test_motions_advised_together_are_distinct(weak):
         {"edge_bias_px": 0.0, "solver": {"bias_correction": False, "advice": {"candidates": 200, "motions": 5}}}
     )
     _, record, _ = advised(weak, config)
-    words = [motion["words"] for motion in record["next_motions"]]
+    words = [motion.words for motion in record.next_motions]
     assert len(words) > 1
     assert len(set(words)) == len(words)
 
@@ -193,9 +196,9 @@ def test_the_number_in_words_is_the_number_in_the_bar(weak):
     candidates = joint_candidates(recording, unknowns, problem, widened, used, CONFIG.solver.advice, seed=0)
     view = camera_view(recording.stereo.right)[None]
     for case in (solution, widened):
-        record = advice_record(case, candidates, view, CONFIG, "within reach")
-        bar = case.observability.describe().directions[0][0]
-        said = re.search(r"shrinks from ([\d.]+) mm to ([\d.]+) mm", record["advice"][0])
-        assert said is not None, record["advice"][0]
+        record = with_advice(case.observability.describe(), case, candidates, view, CONFIG, "within reach")
+        bar = case.observability.describe().directions[0].sigma_at_working_point_mm
+        said = re.search(r"shrinks from ([\d.]+) mm to ([\d.]+) mm", record.advice[0])
+        assert said is not None, record.advice[0]
         assert float(said[1]) == pytest.approx(bar, rel=0.06)
-        assert float(said[2]) == pytest.approx(record["next_motions"][0]["weakest_sigma_mm"], rel=0.06)
+        assert float(said[2]) == pytest.approx(record.next_motions[0].weakest_sigma_mm, rel=0.06)

@@ -1,7 +1,7 @@
 """`evaluate` says what `calibrate` said, and compares with references that are themselves uncertain."""
 
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from rmis_calib.geometry import RigidTransform
 from rmis_calib.geometry.rotations import rotvec_to_matrix
 from rmis_calib.pipeline.evaluation import mahalanobis
 from rmis_calib.results import CalibrationResult, Motions
+from rmis_calib.solver.observability import Observability
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 FEW = {"solver": {"bias_correction": False, "advice": {"motions": 0}}}
@@ -53,13 +54,13 @@ def test_the_same_numbers_from_the_file_as_from_the_calibration(case, tmp_path) 
     again = rc.evaluate(CalibrationResult.read(tmp_path / "result.json"), tmp_path / "recording")
     assert again.head_point_error_px is not None
     for camera, error in result.head_point_error_px.items():
-        assert again.head_point_error_px[camera] == pytest.approx(error, abs=1e-9)
+        assert asdict(again.head_point_error_px[camera]) == pytest.approx(asdict(error), abs=1e-9)
     if case == "clock off":
         assert result.kinematic_offsets.clock_s == pytest.approx(0.4, abs=0.05)
         # Counter-literal: without the clock that was found, the head points are elsewhere.
         without = replace(result, nuisances={k: v for k, v in result.nuisances.items() if k != "clock"})
         worse = rc.evaluate(without, recording).head_point_error_px
-        assert worse is not None and worse["right"]["median"] > 2 * result.head_point_error_px["right"]["median"]
+        assert worse is not None and worse["right"].median > 2 * result.head_point_error_px["right"].median
     if case == "RCM offset":
         assert any(result.kinematic_offsets.rcm_mm)
     if case == "joint offsets":
@@ -139,7 +140,7 @@ def test_the_real_reference_is_not_exact(tmp_path) -> None:
     recording = rc.load_recording(folder)
     result = CalibrationResult(
         "ok", "", "joint", RigidTransform("camera_right", "arm", torch.from_numpy(matrix)), None,
-        np.diag([1e-6] * 3 + [0.01] * 3), {}, Motions(np.ones(1, bool), ("",)),
+        np.diag([1e-6] * 3 + [0.01] * 3), Observability(), Motions(np.ones(1, bool), ("",)),
     )  # fmt: skip
     measured = rc.evaluate(result, recording, folder / "reference.yaml")
     # 2 mm along one axis at 1.2 mm of the reference and 0.1 mm of the result.

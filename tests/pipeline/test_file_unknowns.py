@@ -58,9 +58,9 @@ def test_the_file_gives_the_answer_of_the_kinematics(solved):
     offsets = first.nuisances["joint_offset"]
     for column, value, sigma in zip(unknowns.columns, offsets.value, offsets.sigma, strict=True):
         record = again.nuisances[f"joint_offset {column.rpartition('_')[0]}"]
-        assert record["value"] == pytest.approx(float(value), abs=0.02 * float(sigma) + 1e-9)
-        assert record["unit"] == column.rpartition("_")[2]
-    assert again.nuisances["clock"]["value"] == pytest.approx(CLOCK_S, abs=0.01)
+        assert record.value == pytest.approx(float(value), abs=0.02 * float(sigma) + 1e-9)
+        assert record.unit == column.rpartition("_")[2]
+    assert again.nuisances["clock"].value == pytest.approx(CLOCK_S, abs=0.01)
 
 
 def test_offsets_of_the_file_are_those_of_the_truth_or_held(solved):
@@ -68,10 +68,10 @@ def test_offsets_of_the_file_are_those_of_the_truth_or_held(solved):
     again = rc.solve(seen, ALWAYS, throw=False)
     truth = yaml.safe_load((path / "ground_truth.yaml").read_text())["joint_offsets"]
     records = [again.nuisances[f"joint_offset {column.rpartition('_')[0]}"] for column in unknowns.columns]
-    free = [not record["held"] for record in records]
+    free = [not record.held for record in records]
     assert any(free)
     for column, record, is_free in zip(unknowns.columns, records, free, strict=True):
-        assert not is_free or abs(record["value"] - truth[column]) < 4.0 * record["sigma"]
+        assert not is_free or abs(record.value - truth[column]) < 4.0 * record.sigma
 
 
 def test_first_order_displacement_is_that_of_the_kinematics(solved):
@@ -116,7 +116,7 @@ def test_an_offset_of_no_effect_changes_nothing(solved):
     bare = rc.solve(replace(seen, unknown_names=None, unknown_displacement=None, unknown_at=None), config, throw=False)
     np.testing.assert_allclose(still.covariance, bare.covariance, rtol=1e-6)
     np.testing.assert_allclose(still.camera_right_T_arm.matrix, bare.camera_right_T_arm.matrix, atol=1e-8)
-    assert still.nuisances["clock"]["held"]
+    assert still.nuisances["clock"].held
 
 
 def test_the_table_of_another_tool_is_named(solved):
@@ -125,7 +125,7 @@ def test_the_table_of_another_tool_is_named(solved):
     other = replace(seen, rcm_s_end_mm=seen.rcm_s_end_mm + 50.0)
 
     def sentences(observations):
-        return rc.solve(observations, throw=False).observability["sentences"]
+        return rc.solve(observations, throw=False).observability.sentences
 
     assert any("mm before the place" in words and "another tool" in words for words in sentences(other))
     assert not any("another tool" in words for words in sentences(seen))

@@ -12,7 +12,8 @@ import data_synth
 import rmis_calib as rc
 from rmis_calib.config import parse_config
 from rmis_calib.pipeline.misfit import SignedResiduals, likely_causes, misfit_message
-from rmis_calib.results import Motions
+from rmis_calib.results import Motions, Nuisance
+from rmis_calib.solver.observability import Observability
 
 N = 120
 CLOCK, PLACE, SWAPPED = "the clock or the frame rate", "focal length, crop or lens", "look swapped"
@@ -53,9 +54,12 @@ def test_only_a_noise_that_no_robot_has_is_quoted(mm, deg, told) -> None:
         camera_right_T_arm=None,
         camera_left_T_camera_right=None,
         covariance=None,
-        observability={},
+        observability=Observability(),
         motions=Motions(np.zeros(0, dtype=bool), (), None),
-        nuisances={"noise kinematics_mm": {"value": mm}, "noise kinematics_rad": {"value": np.deg2rad(deg)}},
+        nuisances={
+            "noise kinematics_mm": Nuisance(mm, None, "mm"),
+            "noise kinematics_rad": Nuisance(np.deg2rad(deg), None, "rad"),
+        },
     )
     message = misfit_message(result, ["the cameras look swapped"])
     assert ("as if the joints were noisy" in message) == told

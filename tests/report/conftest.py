@@ -45,11 +45,7 @@ def make_result(**changes: Any) -> CalibrationResult:
             "shaft_radius": {"value": 4.0113, "sigma": 0.0121, "unit": "mm"},
             "end_offset": {"value": -3.21, "sigma": 0.11, "unit": "mm"},
             "clock_offset": {"value": 0.0, "sigma": None, "unit": "s"},
-            "stereo_translation_correction": {
-                "value": [0.012, -0.003, 0.001],
-                "sigma": [0.02, 0.02, 0.03],
-                "unit": "mm",
-            },
+            "stereo_translation[0]": {"value": 0.012, "sigma": 0.02, "unit": "mm"},
         },
         head_point_error_px={"right": {"median": 1.1, "rms": 1.42, "max": 3.6, "count": 56}},
         config={"solver": {"method": "joint", "robust_scale": 1.5}, "detector": {"min_length_px": 60, "seed": None}},
@@ -81,17 +77,13 @@ def observability() -> dict[str, Any]:
         ("translation along the shaft", 0.031),
         ("rotation about the image's horizontal axis", 0.018),
     )
-    vectors = np.linalg.qr(np.random.default_rng(1).normal(size=(6, 6)))[0]
     return {
         "verdict": "trustworthy",
         "sentences": [
             "Every direction of the unknown is seen: the weakest moves the working point by 0.19 mm at one sigma."
         ],
         "working_point_sigma_mm": 0.24,
-        "directions": [
-            {"sigma_at_working_point_mm": sigma, "words": text, "vector": vector.tolist()}
-            for (text, sigma), vector in zip(words, vectors, strict=True)
-        ],
+        "directions": [{"sigma_at_working_point_mm": sigma, "words": text} for text, sigma in words],
         "named_cases": [],
         "advice": [],
     }
@@ -107,12 +99,10 @@ UNOBSERVABLE = {
         {
             "sigma_at_working_point_mm": None,
             "words": "translation along the viewing direction",
-            "vector": [0, 0, 0, 0.02, -0.01, 0.999],
         },
         {
             "sigma_at_working_point_mm": 12.4,
             "words": "translation across the shaft",
-            "vector": [0.01, 0, 0, 0.7, 0.7, 0],
         },
         {"sigma_at_working_point_mm": 0.31, "words": "rotation about the viewing direction"},
     ],

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from rmis_calib.report.content import covariance_text, observability
-from rmis_calib.report.formatting import any_value, fixed, significant
+from rmis_calib.report.formatting import fixed, significant
 from rmis_calib.report.plots import plot_residuals
+from rmis_calib.solver.observability import Direction, Observability
 
 
 @pytest.mark.parametrize(
@@ -34,23 +35,17 @@ def test_fixed_has_no_negative_zero_and_an_ascii_minus() -> None:
     assert fixed(-1.5, 2) == "-1.50"
 
 
-def test_any_value_reads_numbers_lists_and_text() -> None:
-    assert any_value([0.5, None, np.float64(2.0)]) == "0.5000, unknown, 2.000"
-    assert any_value(np.array([1.0, 2.0])) == "1.000, 2.000"
-    assert (any_value(True), any_value(7), any_value("fixed"), any_value(None)) == ("True", "7", "fixed", "unknown")
-
-
 def test_directions_are_ordered_and_placed_on_a_log_scale() -> None:
-    raw = {"directions": [{"sigma_at_working_point_mm": sigma} for sigma in (0.1, 10.0, None, 1.0)]}
-    shown = observability(raw)
+    shown = observability(Observability(directions=[Direction(sigma, "turn") for sigma in (0.1, 10.0, None, 1.0)]))
     assert [item.sigma_mm for item in shown.directions] == ["not bounded", "10 mm", "1.0 mm", "0.10 mm"]
     # axis from 0.1 to 10 mm: 1 mm lies in its middle; the smallest keeps a visible sliver
     assert [item.bar_percent for item in shown.directions] == [100.0, 100.0, 50.0, 0.5]
     assert [label for _, label in shown.ticks] == ["0.1", "1", "10"]
 
 
-def test_observability_without_any_key_is_open() -> None:
-    assert (observability({}).verdict, observability({}).tone) == ("not assessed", "open")
+def test_observability_that_was_not_assessed_is_open() -> None:
+    shown = observability(Observability())
+    assert (shown.verdict, shown.tone) == ("not assessed", "open")
 
 
 def test_robust_scale_is_of_used_motions() -> None:

@@ -154,17 +154,15 @@ def test_every_text_is_escaped(result_with: MakeResult, page_of: Callable[..., P
     assert pose is not None
     result = result_with(
         message=hostile,
-        method=hostile,
         camera_right_T_arm=RigidTransform("camera_right", hostile, pose.matrix),
         observability={key: [hostile] for key in ("sentences", "named_cases", "advice")}
         | {
-            "verdict": hostile,
-            "directions": [{"words": hostile, "sigma_at_working_point_mm": 1.0, "vector": [0.0] * 6}],
+            "directions": [{"words": hostile, "sigma_at_working_point_mm": 1.0}],
         },
         motions=Motions(np.array([True, False]), ("", hostile)),
         residuals={hostile: {"unit": hostile, "median": 1.0, "rms": 1.0, "by_motion": [1.0, -2.0]}},
-        nuisances={hostile: {"value": hostile, "sigma": hostile, "unit": hostile}},
-        head_point_error_px={hostile: {}},
+        nuisances={hostile: {"value": 1.0, "sigma": 1.0, "unit": hostile}},
+        head_point_error_px={hostile: {"median": 1.0, "rms": 1.0, "max": 1.0, "count": 1}},
         config={hostile: hostile},
         versions={hostile: hostile},
     )

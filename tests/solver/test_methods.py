@@ -7,7 +7,6 @@ import torch
 
 from rmis_calib.geometry.rotations import rotation_angle
 from rmis_calib.solver import LineStatistics, Problem, SolverSettings, SolveStatus, Verdict, solve
-from rmis_calib.solver.observability import VERDICTS
 from rmis_calib.solver.settings import NoiseSettings, UnknownSettings
 from rmis_calib.solver.solution import concatenate
 from rmis_calib.solver.start.paper import linear_rotation, solve_paper
@@ -62,7 +61,7 @@ def test_joint_is_within_three_sigma_at_realistic_noise(simulate, realistic, kin
     assert bool((degrees < 3.0 * solution.rotation_sigma_deg).all())
     assert bool((mm < 3.5 * solution.translation_sigma_mm).all())
     assert float(solution.chi2_per_dof.mean()) == pytest.approx(1.0, abs=0.1)
-    assert VERDICTS[int(solution.verdict[0])] is Verdict.TRUSTWORTHY
+    assert Verdict.of(solution.verdict[0]) is Verdict.TRUSTWORTHY
 
 
 @pytest.mark.parametrize("method", ["paper", "global", "joint"])

@@ -134,4 +134,4 @@ def test_an_observations_file_of_head_points_alone(moving):
     result = rc.solve(seen, parse_config({"measurements": ["heads"]}))
     gap = result.camera_right_T_arm.t.numpy() - truth["camera_right_T_arm"][0, :3, 3]
     assert np.linalg.norm(gap) < 3.5 * result.translation_sigma_mm
-    assert result.observability["next_motions"]
+    assert result.observability.next_motions

@@ -20,9 +20,9 @@ from rmis_calib.solver.model.normal_equations import NoiseModel, motion_distance
 from rmis_calib.solver.model.parameters import TRANSLATION_SIGMA_MM, UNITS, NuisancePriors, initial_state
 from rmis_calib.solver.model.residuals import residual_rows
 from rmis_calib.solver.model.state import State
-from rmis_calib.solver.observability import Degeneracy, ObservabilityTensors
+from rmis_calib.solver.observability import Degeneracy, ObservabilityTensors, Verdict
 from rmis_calib.solver.problem import Problem
-from rmis_calib.solver.settings import SolverSettings
+from rmis_calib.solver.settings import Method, SolverSettings
 from rmis_calib.solver.solution import AlternativeModel, Nuisance, Posterior, Solution
 from rmis_calib.solver.start.candidates import COLLAPSED_MM, collapsed
 from rmis_calib.solver.status import MotionReason, SolveStatus
@@ -37,7 +37,7 @@ measured; longer recordings are sampled evenly."""
 
 
 def two_step_solution(
-    flat: Problem, R: Tensor, t: Tensor, covariance: Tensor, settings: SolverSettings, method: str
+    flat: Problem, R: Tensor, t: Tensor, covariance: Tensor, settings: SolverSettings, method: Method
 ) -> Solution:
     """Solution of `paper` and `global`, which use the axis lines alone."""
     axis_only = flat.only("axis")
@@ -58,7 +58,8 @@ def two_step_solution(
     # A two-step estimate from a laparoscope that stands still is biased by more than its scatter shows (DESIGN.md,
     # section 3).
     observability = replace(
-        observability, verdict=torch.where(static, observability.verdict.clamp_min(1), observability.verdict)
+        observability,
+        verdict=torch.where(static, observability.verdict.clamp_min(Verdict.WEAK.code), observability.verdict),
     )
     shown = _residuals(measured, state)
     return Solution(

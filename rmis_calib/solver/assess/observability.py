@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from rmis_calib.geometry.rotations import skew
-from rmis_calib.solver.observability import Degeneracy, ObservabilityTensors
+from rmis_calib.solver.observability import Degeneracy, ObservabilityTensors, Verdict
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import NoiseSettings, VerdictSettings
 
@@ -64,7 +64,9 @@ def assess(
         rotation_sigma_deg=rotation,
         sigma_mm=values.flip(-1).clamp_min(0.0).sqrt(),
         directions=vectors.flip(-1).mT,
-        verdict=torch.where(blind, 2, weak.long()),
+        verdict=torch.where(
+            blind, Verdict.UNOBSERVABLE.code, torch.where(weak, Verdict.WEAK.code, Verdict.TRUSTWORTHY.code)
+        ),
         degeneracy=degeneracy,
         shaft_direction=v / torch.linalg.vector_norm(v, dim=-1, keepdim=True).clamp_min(1e-12),
     )

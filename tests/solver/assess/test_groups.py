@@ -9,6 +9,7 @@ from rmis_calib.config import parse_config
 from rmis_calib.geometry.rotations import matrix_to_rotvec
 from rmis_calib.pipeline.result import about_groups
 from rmis_calib.pipeline.words import ranges_in_words
+from rmis_calib.results import Change, Consistency, Shift
 from rmis_calib.solver import Problem, solve
 from rmis_calib.solver.assess.groups import neighbours
 from rmis_calib.solver.settings import SolverSettings
@@ -128,21 +129,26 @@ def test_a_camera_that_was_knocked_is_told_and_not_believed(simulate, realistic,
     result = rc.solve(knocked(realistic, angle, simulate), config, throw=False)
     assert result.status == "weak"
     assert "what comes before motion 32 and after differs" in result.message
-    change = result.consistency["change"]
-    assert change["sigmas"] > 5.5
-    assert change["rotation_deg"] == pytest.approx(np.rad2deg(angle), abs=0.5)
-    assert rc.CalibrationResult.from_dict(result.to_dict()).consistency == result.to_dict()["consistency"]
+    change = result.consistency.change
+    assert change.sigmas > 5.5
+    assert change.rotation_deg == pytest.approx(np.rad2deg(angle), abs=0.5)
+    again = rc.CalibrationResult.from_dict(result.to_dict())
+    assert again.to_dict()["consistency"] == result.to_dict()["consistency"]
 
 
 def test_a_camera_that_stands_still_is_believed(simulate, realistic) -> None:
     result = rc.solve(knocked(realistic, 0.0, simulate), throw=False)
     assert result.status == "ok"
-    groups = result.consistency["groups"]
-    assert sum(group["motions"] for group in groups) == int(result.motions.used.sum())
+    groups = result.consistency.groups
+    assert sum(group.motions for group in groups) == int(result.motions.used.sum())
 
 
 def test_words() -> None:
     assert ranges_in_words([3, 7, 8, 9, 12]) == "3, 7 to 9, 12"
     assert ranges_in_words([1, 3, 5, 7, 9]) == "1, 3, 5, 7, ..."
     assert about_groups(None) == ()
-    assert about_groups({"inflation": 1.1}) == ()
+    slight = {"rotation_deg": 0.1, "translation_mm": 0.1, "sigmas": 0.5}
+    agreeing = Consistency(
+        inflation=1.1, group_by_motion=[], groups=(), halves=Shift(**slight), change=Change(**slight, before_motion=0)
+    )
+    assert about_groups(agreeing) == ()

@@ -1,0 +1,16 @@
+from .parts import Change as Change
+from .parts import Consistency as Consistency
+from .parts import GroupShift as GroupShift
+from .parts import HeadPointError as HeadPointError
+from .parts import Information as Information
+from .parts import KinematicOffsets as KinematicOffsets
+from .parts import Motions as Motions
+from .parts import Nuisance as Nuisance
+from .parts import Residual as Residual
+from .parts import Shift as Shift
+from .result import INTRINSICS as INTRINSICS
+from .result import JOINT_OFFSET as JOINT_OFFSET
+from .result import STATUS_SENTENCES as STATUS_SENTENCES
+from .result import CalibrationResult as CalibrationResult
+from .result import Status as Status
+from .result import package_versions as package_versions

@@ -1,0 +1,170 @@
+"""The parts of a result. Each is what its key in result.json holds; an unknown number is None, in an array NaN."""
+
+from collections import Counter
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field, computed_field, model_serializer, model_validator
+from pydantic.dataclasses import dataclass
+
+from rmis_calib.io.plain_values import FILE_PART, Flags, Indices, Number, Square, Vector
+
+
+@dataclass(frozen=True, eq=False, config=FILE_PART)
+class Motions:
+    """Which motions carried the result."""
+
+    used: Annotated[Flags, Field(alias="used_by_motion")]
+    """Whether each motion entered the estimate, (N,)."""
+    reasons: Annotated[tuple[str, ...], Field(alias="reason_by_motion")]
+    """Why each motion did not enter, N texts; empty for one that was used without reservation."""
+    timestamps_s: Vector | None = None
+    """Time of each motion's frame in seconds, (N,), null where unknown; null without frame times."""
+
+    @computed_field
+    @property
+    def total(self) -> int:
+        """Number of motions."""
+        return len(self.used)
+
+    @computed_field(alias="used")
+    @property
+    def used_count(self) -> int:
+        """Number of motions that entered the estimate."""
+        return int(self.used.sum())
+
+    @computed_field(alias="rejected")
+    @property
+    def rejected_by_reason(self) -> dict[str, int]:
+        """Number of motions that did not enter, by reason."""
+        return dict(Counter(self.reasons[motion] for motion in np.flatnonzero(~self.used).tolist()))
+
+
+@dataclass(frozen=True, eq=False, config=FILE_PART)
+class Residual:
+    """Residuals of one kind of measurement, in one camera."""
+
+    unit: str
+    """Unit of the numbers, `px` where there is a camera."""
+    median: Number
+    """Median over the used motions; null when none was measured."""
+    rms: Number
+    """Root mean square over the used motions; null when none was measured."""
+    by_motion: Vector
+    """Residual of each motion, (N,), null where not measured."""
+
+
+@dataclass(frozen=True, config=FILE_PART)
+class Nuisance:
+    """An unknown or noise level that was estimated, or assumed, beside the transform."""
+
+    value: Number
+    """The estimate, in `unit`."""
+    sigma: Number
+    """1 sigma of it, in `unit`; null for a noise level."""
+    unit: str
+    """Unit of value and sigma."""
+    held: bool | None = None
+    """Whether the data could not tell it, so that its prior holds it; absent for a noise level."""
+
+    @model_serializer(mode="wrap")
+    def _without_absent(self, plain):
+        return {key: value for key, value in plain(self).items() if key != "held" or value is not None}
+
+
+@dataclass(frozen=True, config=FILE_PART)
+class HeadPointError:
+    """Distance of the labelled head points of one camera from where the result puts them."""
+
+    median: Number
+    """Median distance, px."""
+    rms: Number
+    """Root mean square distance, px."""
+    max: Number
+    """Largest distance, px."""
+    count: int
+    """Number of labelled head points."""
+
+
+@dataclass(frozen=True, config=FILE_PART)
+class Shift:
+    """Difference of two answers for `camera_right_T_arm`."""
+
+    # Not docstrings, which the classes below would not inherit.
+    rotation_deg: Annotated[Number, Field(description="Angle between the rotations, degrees.")]
+    translation_mm: Annotated[Number, Field(description="Distance between the translations, mm, in `camera_right`.")]
+    sigmas: Annotated[Number, Field(description="Length of the difference in its own sigmas, 6 degrees of freedom.")]
+
+
+@dataclass(frozen=True, config=FILE_PART)
+class GroupShift(Shift):
+    """How the answer moves when a group of neighbouring motions is left out."""
+
+    motions: int = Field(kw_only=True)
+    """Number of motions of the group."""
+
+
+@dataclass(frozen=True, config=FILE_PART)
+class Change(Shift):
+    """The clearest difference between what comes before and after one motion."""
+
+    before_motion: int = Field(kw_only=True)
+    """Index of the first motion after the change."""
+
+
+@dataclass(frozen=True, eq=False, config=FILE_PART)
+class Consistency:
+    """Whether parts of the data agree."""
+
+    inflation: Number
+    """Factor by which sigma grew because groups of neighbouring motions disagree; 1 where they agree."""
+    group_by_motion: Indices
+    """Number of each motion's group, (N,); -1 for one that was not used."""
+    groups: tuple[GroupShift, ...]
+    """How the answer moves without each group."""
+    halves: Shift
+    """Difference of the answers from two halves of the motions that are far from each other in joint space."""
+    change: Change
+    """The clearest difference between what comes before and after one motion."""
+
+
+@dataclass(frozen=True, eq=False, config=FILE_PART)
+class Information:
+    """What a recording tells of the transform and of the unknowns that recordings of one set-up share, for pooling."""
+
+    shared_names: tuple[str, ...]
+    """The s unknowns beside the transform (`radius`, `stereo_rotation[0]`, ...)."""
+    shared_prior_sigma: Vector
+    """1 sigma of the prior of each, (s,), in units as among the nuisances; `matrix` does not contain the priors."""
+    matrix: Square
+    """(6 + s, 6 + s) inverse covariance: rotation (rad) and translation (mm) as in the result's covariance, then the
+    unknowns' deviations from their nominal values, in units as among the nuisances."""
+    vector: Vector
+    """(6 + s,) `matrix` times the estimate of these that the data alone give, the transform at the result's."""
+
+    @model_validator(mode="after")
+    def _of_one_size(self) -> "Information":
+        size = len(self.shared_names)
+        shapes = (self.shared_prior_sigma.shape, self.matrix.shape, self.vector.shape)
+        if shapes != ((size,), (6 + size, 6 + size), (6 + size,)):
+            raise ValueError(f"a vector and a matrix of 6 and the {size} shared_names")
+        return self
+
+    def transform_covariance(self) -> np.ndarray:
+        """(6, 6) covariance of the transform that this and the priors give."""
+        full = self.matrix.copy()
+        full[np.diag_indices(len(full))] += np.concatenate([np.zeros(6), self.shared_prior_sigma**-2.0])
+        root = np.diagonal(full) ** -0.5
+        return (np.linalg.inv(full * root[:, None] * root) * root[:, None] * root)[:6, :6]
+
+
+@dataclass(frozen=True)
+class KinematicOffsets:
+    """What was found to be off in the logged kinematics; zero where it was not estimated."""
+
+    joints: dict[str, float]
+    """Offset of each joint that has one, by its column (`<arm>.<joint>_rad` or `_mm`), added to its readings."""
+    clock_s: float
+    """Added to the times at which the joints are read, beside the recording's own offset."""
+    rcm_mm: tuple[float, float]
+    """Of the shaft's axis from the nominal RCM, along two directions across it that are fixed to `rcm`."""
