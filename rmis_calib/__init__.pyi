@@ -6,6 +6,8 @@ from .batches import compare as compare
 from .batches import pool as pool
 from .config import CalibrationConfig as CalibrationConfig
 from .config import load_config as load_config
+from .convert import ConvertSettings as ConvertSettings
+from .convert import convert as convert
 from .errors import CalibrationFailed as CalibrationFailed
 from .errors import InputError as InputError
 from .errors import RmisCalibError as RmisCalibError

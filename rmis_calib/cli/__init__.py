@@ -24,6 +24,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "solve": ("Solve", "estimate camera_right_T_arm from an observations file (.npz)"),
     "export": ("Export", "write a result as another program reads it: dVRK, ROS, MoveIt, OpenCV, URDF and more"),
     "evaluate": ("Evaluate", "measure a result against head points and against a truth file"),
+    "convert": ("Convert", "make a recording of a ROS bag, a dVRK session, a data set, or pictures with a table"),
     "cameras show": ("CamerasShow", "print a camera file of any known format as stereo.yaml, and draw it"),
     "robots list": ("RobotsList", "list the shipped robots"),
     "robots show": ("RobotsShow", "print a robot as robot.yaml"),

@@ -19,6 +19,7 @@ from rmis_calib.cli.batch_console import (
     stopped_by_signal,
 )
 from rmis_calib.cli.console import ProgressCallback, conclude, conclude_check, print_table, progress_reporter, say
+from rmis_calib.cli.convert_command import Convert as Convert
 from rmis_calib.cli.equipment import CamerasShow as CamerasShow
 from rmis_calib.cli.equipment import RobotsCheck as RobotsCheck
 from rmis_calib.cli.equipment import RobotsImport as RobotsImport

@@ -79,6 +79,7 @@ class RecordingSchema(Schema):
     crop_right: Crop | None = None
     crop_left: Crop | None = None
     rolling_shutter_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    notes: list[str] = Field(default_factory=list)
 
     @property
     def stereo_files(self) -> tuple[str, ...]:

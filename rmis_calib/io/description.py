@@ -66,7 +66,7 @@ def read_description(path: str | Path, clock_offset_s: float | None = None) -> R
     offset = schema.clock_offset_s if clock_offset_s is None else clock_offset_s
     if not np.isfinite(offset):
         raise InputError(where="clock_offset_s", expected="a finite number of seconds", found=offset)
-    notes: list[str] = []
+    notes = list(schema.notes)
     robot = _load_robot(schema, folder, notes.append)
     stereo = _cameras(schema, _read_cameras(schema, folder, notes.append), where)
     arms = tuple(arm for arm in (schema.laparoscope_arm, schema.instrument_arm) if arm is not None)

@@ -60,7 +60,7 @@ def test_contracts_say_what_the_design_says() -> None:
     rows = [[name.strip(" ()") for name in row.split("|")] for row in layers]
     assert rows == [
         ["cli"],
-        ["batches", "exports", "studies", "viewer"],
+        ["batches", "convert", "exports", "studies", "viewer"],
         ["report", "parallel"],
         ["pipeline"],
         ["results"],

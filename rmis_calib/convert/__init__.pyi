@@ -1,0 +1,2 @@
+from .run import convert as convert
+from .settings import ConvertSettings as ConvertSettings

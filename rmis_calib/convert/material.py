@@ -1,0 +1,68 @@
+"""What a source holds, whatever it is: logs of arms in SI units, cameras, and pictures that are written already."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from rmis_calib.io._checks import Note
+from rmis_calib.io.intrinsics import StereoFile
+
+ProgressCallback = Callable[[str, int, int], None]
+
+NS = 1_000_000_000
+
+
+@dataclass
+class ArmLog:
+    """What a source logs of one arm; SI units, stamps in ns."""
+
+    name: str
+    joint_ns: list[int] = field(default_factory=list)
+    joints: list[np.ndarray] = field(default_factory=list)
+    """rad and m."""
+    joint_names: tuple[str, ...] = ()
+    pose_ns: list[int] = field(default_factory=list)
+    poses: list[np.ndarray] = field(default_factory=list)
+    """x, y, z (m), qx, qy, qz, qw of the tip."""
+    is_local: bool = False
+    """Poses are relative to the arm's own base (the RCM), not to another frame."""
+    pose_frame: str = ""
+
+    @property
+    def has_joints(self) -> bool:
+        return bool(self.joints)
+
+
+@dataclass
+class Material:
+    """All that a recording is made of."""
+
+    arms: dict[str, ArmLog]
+    cameras: StereoFile | None
+    frame_ns: np.ndarray
+    """(N,) int64, on the clock of the arms' stamps."""
+    right: str
+    """File or folder of the right pictures, in the recording."""
+    left: str | None = None
+    stereo_layout: Literal["side_by_side", "top_bottom"] | None = None
+    swapped: bool = False
+    robot: str | None = None
+    """Robot that the source itself implies."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """Where a source reads from and writes to."""
+
+    source: Path
+    folder: Path
+    """The recording in the making."""
+    note: Note
+    progress: ProgressCallback
+
+
+Poses = Float[np.ndarray, "n 7"]
