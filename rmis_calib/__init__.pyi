@@ -43,6 +43,7 @@ from .solver.own_measurement import Measurement as Measurement
 from .studies import study_motions as study_motions
 from .studies import study_noise as study_noise
 from .studies import study_plan as study_plan
+from .viewer import open_viewer as open_viewer
 from .vision import ShaftDetector as ShaftDetector
 
 __version__: str

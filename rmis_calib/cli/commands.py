@@ -28,6 +28,7 @@ from rmis_calib.cli.equipment import RobotsShow as RobotsShow
 from rmis_calib.cli.paths import beside, check_output_folder, setting_inputs
 from rmis_calib.cli.study_commands import parse_study
 from rmis_calib.cli.usage import parse_arguments
+from rmis_calib.cli.view import View as View
 from rmis_calib.config import CalibrationConfig, load_config
 from rmis_calib.errors import InputError, OutputError
 from rmis_calib.exports.settings import ExportSettings, FormatName

@@ -115,6 +115,27 @@ class RobotKinematics:
         rcm_p_head, rcm_p_straight = transform_points(rcm_T_base @ base_T_head, self._head_p_point).unbind(0)
         return InstrumentPose(base_T_rcm, rcm_v_axis, rcm_p_head, (rcm_v_axis * rcm_p_straight).sum(-1))
 
+    def laparoscope_points(self, joints: Float[Tensor, "*batch j"]) -> Float[Tensor, "*batch frames 3"]:
+        """Origins of the laparoscope arm's DH frames in `base`, its base first and its tool last, mm.
+
+        Raises:
+            ShapeError: another number of joints, another dtype, or no such arm.
+        """
+        if self._laparoscope is None:
+            raise ShapeError(where="laparoscope readings", expected="an arm", found="a camera on no arm")
+        self._laparoscope.check(joints)
+        frames = self._laparoscope.frames_in_base(joints)
+        return torch.cat((frames[..., :3, 3], self.base_T_arm(joints)[..., None, :3, 3]), dim=-2)
+
+    def instrument_points(self, joints: Float[Tensor, "*batch j"]) -> Float[Tensor, "*batch frames 3"]:
+        """Origins of the instrument arm's DH frames in `base`, its base first, mm.
+
+        Raises:
+            ShapeError: another number of joints, or another dtype.
+        """
+        self._instrument.check(joints)
+        return self._instrument.frames_in_base(joints)[..., :3, 3]
+
     def rcm_distance_mm(self) -> float | None:
         """How far the two arms' remote centres of motion are apart; None where the laparoscope's arm has none.
 

@@ -1,0 +1,2 @@
+from .server import Viewer as Viewer
+from .server import open_viewer as open_viewer
