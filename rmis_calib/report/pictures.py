@@ -65,7 +65,8 @@ def _overlay(
             draw_dot(canvas, view.camera.project(end)[0].numpy(), DETECTED_RGB, 2 * thickness)
     camera = run.camera(view)
     if contour_n is not None and camera is not None:
-        for polyline in contour_polylines(contour_n, camera):
+        end_known = run.result.nuisances.get("end_offset") is not None
+        for polyline in contour_polylines(contour_n, camera, camera_p_end if end_known else None):
             draw_polyline(canvas, polyline, PREDICTED_RGB, max(1, thickness - 1))
     if camera_p_end is not None and camera is not None:
         uv, visible = camera.project(camera_p_end.cpu())
@@ -84,13 +85,25 @@ def _caption(result: CalibrationResult, side: str, frame: int) -> str:
     return reason or ("not measured here" if px is None else f"contours {px:.2f} px from the prediction")
 
 
-def contour_polylines(contour_n: Float[Tensor, "2 3"], camera: Camera) -> Float[np.ndarray, "2 p 2"]:
-    """Both contour planes as raw-pixel polylines across the picture; NaN where the lens model does not reach."""
+def contour_polylines(
+    contour_n: Float[Tensor, "2 3"], camera: Camera, camera_p_end: Float[Tensor, " 3"] | None = None
+) -> Float[np.ndarray, "2 p 2"]:
+    """Both contour planes as raw-pixel polylines across the picture; NaN where the lens model does not reach, and$
+    beyond the shaft's end, where it is known.
+
+    Args:
+        contour_n: normals of `contour_planes`, whose sign tells which way the tip is.
+        camera: that sees them.
+        camera_p_end: the shaft's end on its axis, mm.
+    """
     line = contour_n.cpu() / contour_n[:, :2].cpu().norm(dim=-1, keepdim=True)
     foot = -line[:, 2:] * line[:, :2]
-    along = torch.stack([-line[:, 1], line[:, 0]], dim=-1)
+    along = torch.stack([line[:, 1], -line[:, 0]], dim=-1)  # towards the tip
     reach = 2.0 * max(camera.image_size) / float(camera.focal)
     steps = torch.linspace(-reach, reach, _SAMPLES, dtype=line.dtype)
     xy = foot[:, None] + along[:, None] * steps[:, None]
     uv, valid = camera.project(torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1))
+    if camera_p_end is not None and float(camera_p_end[2]) > 0:
+        end_xy = camera_p_end[:2].cpu() / camera_p_end[2].cpu()
+        valid = valid & (((xy - end_xy) * along[:, None]).sum(-1) <= 0)
     return torch.where(valid[..., None], uv, torch.nan).numpy()

@@ -234,7 +234,8 @@ class Viewer:
             p = transform_points(camera_T_base, torch.as_tensor(shown.scene.rcm[at]))
             d = torch.nn.functional.normalize(rotate_vectors(camera_T_base, base_v), dim=-1)
             camera = self._recording.stereo.right.corrected(*self._results[name].intrinsic_correction("right"))
-            for polyline in contour_polylines(contour_planes(p, d, shown.scene.radius_mm), camera):
+            end = transform_points(camera_T_base, torch.as_tensor(shown.scene.end[at]))
+            for polyline in contour_polylines(contour_planes(p, d, shown.scene.radius_mm), camera, end):
                 draw_polyline(canvas, polyline / step, shown.colour, 2)
         return canvas
 
