@@ -134,9 +134,13 @@ class Viewer:
         gui.add_markdown(
             f"Ellipsoids: {SIGMAS:.0f} sigma of the point where the instrument works. Millimetres, in `base`."
         )
-        self._slider.on_update(lambda _: self._slider.value != self._motion and self.show(int(self._slider.value)))
+        self._slider.on_update(lambda _: self._moved())
         play.on_update(lambda _: self._playing.set() if play.value else self._playing.clear())
         ghost.on_update(lambda _: self._draw_ghosts(ghost.value))
+
+    def _moved(self) -> None:
+        if self._slider.value != self._motion:  # moved by a person, and not by `show`
+            self.show(int(self._slider.value))
 
     def _draw_fixed(self) -> None:
         scene = self._server.scene
