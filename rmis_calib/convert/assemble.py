@@ -8,9 +8,10 @@ import numpy as np
 import yaml
 
 from rmis_calib.convert.joints import Readings, choose_robot, motion_of, readings_of, robot_arms
-from rmis_calib.convert.material import NS, ArmLog, Job, Material
+from rmis_calib.convert.material import NEEDS_STEREO, NS, ArmLog, Job, Material
 from rmis_calib.convert.settings import ConvertSettings
 from rmis_calib.errors import RecordingError
+from rmis_calib.io.joints import JointLog
 from rmis_calib.io.robot import load_robot
 from rmis_calib.robot import Robot
 
@@ -117,7 +118,11 @@ def _write_joints(path: Path, robot: Robot, arms: dict[str, ArmLog], origin_ns: 
         raise RecordingError(where=str(job.source), expected="logs of both arms at the same time", found=spans)
     order = [name for name in robot.arms if name in readings]
     columns = [column for name in order for column in robot.columns(name)]
-    values = np.concatenate([_at(readings[name], ns) for name in order], axis=1)
+    found = [_at(readings[name], robot.columns(name), ns) for name in order]
+    known = np.logical_and.reduce([valid for _, valid in found])
+    if not known.all():
+        job.note(f"{int((~known).sum())} of {len(ns)} samples were left out: one arm's log has a gap there")
+    values, ns = np.concatenate([rows for rows, _ in found], axis=1)[known], ns[known]
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["timestamp_s", *columns])
@@ -125,11 +130,10 @@ def _write_joints(path: Path, robot: Robot, arms: dict[str, ArmLog], origin_ns: 
             writer.writerow([_seconds(stamp - origin_ns), *(repr(value) for value in row)])
 
 
-def _at(readings: Readings, ns: np.ndarray) -> np.ndarray:
-    """(T, J) at some stamps: exact where they are the arm's own, else on the line between neighbours."""
+def _at(readings: Readings, columns: tuple[str, ...], ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(T, J) at some stamps and (T,) where they are known: never across a gap in the arm's log."""
     start = readings.ns[0]
-    own, wanted = (readings.ns - start).astype(np.float64), (ns - start).astype(np.float64)
-    return np.stack([np.interp(wanted, own, column) for column in readings.values.T], axis=1)
+    return JointLog((readings.ns - start) / NS, columns, readings.values).at((ns - start) / NS)
 
 
 def _write_frame_times(path: Path, frame_ns: np.ndarray, origin_ns: int) -> None:
@@ -163,8 +167,7 @@ def _stereo_entry(material: Material, job: Job, settings: ConvertSettings) -> st
     if settings.stereo is not None:
         cameras = read_stereo(settings.stereo, job.note, picture_size)
     if cameras is None:
-        expected = "--stereo FILE, the cameras' calibration (any format of `rmis-calib cameras show`)"
-        raise RecordingError(where=str(job.source), expected=expected, found="no calibration in the source")
+        raise RecordingError(where=str(job.source), expected=NEEDS_STEREO, found="no calibration in the source")
     text = yaml.safe_dump(cameras.to_dict(), sort_keys=False, default_flow_style=None, width=200)
     (job.folder / "stereo.yaml").write_text(text, encoding="utf-8")
     return "stereo.yaml"

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from rmis_calib.convert.material import ArmLog, Job, Material
+from rmis_calib.convert.joints import NEEDS_ROBOT, NO_POSES
+from rmis_calib.convert.material import NEEDS_STEREO, ArmLog, Job, Material
 from rmis_calib.convert.messages import camera_info_of, pose_of, stamp_ns, write_picture
 from rmis_calib.convert.salvage import salvaged
 from rmis_calib.convert.settings import ConvertSettings
@@ -126,7 +127,19 @@ def convert_bag(job: Job, settings: ConvertSettings) -> Material:
                 "pictures (sensor_msgs Image or CompressedImage): a calibration needs the cameras' view of the shaft"
             )
             raise RecordingError(where=where, expected=expected, found=describe(bag.topics))
+        _check_before_reading(choice, settings, where)
         return _read(bag, choice, job, settings)
+
+
+def _check_before_reading(choice: Choice, settings: ConvertSettings, where: str) -> None:
+    """What would be missing at the end, before gigabytes are read."""
+    needed = {"right", "left"} if choice.left is not None else {"right"}
+    if settings.stereo is None and not needed <= set(choice.infos):
+        raise RecordingError(
+            where=where, expected=NEEDS_STEREO, found="no camera_info of " + " and ".join(sorted(needed))
+        )
+    if settings.robot is None and not set(choice.joints) & set(choice.poses):
+        raise RecordingError(where=where, expected=NEEDS_ROBOT, found=NO_POSES)
 
 
 def read_logs(path: Path, settings: ConvertSettings, note: Note) -> tuple[dict[str, ArmLog], dict[str, CameraInfo]]:

@@ -12,6 +12,8 @@ from rmis_calib.io.robot import load_robot
 from rmis_calib.robot import Arm, Robot
 
 DVRK_ROBOTS = ("dvrk-classic", "dvrk-si", "dvrk-classic-si-tool")
+NEEDS_ROBOT = f"--robot (one of {', '.join(DVRK_ROBOTS)}, or your robot.yaml)"
+NO_POSES = "no poses beside the joints, which alone do not tell a Classic arm from an S or Si (50.8 mm along the shaft)"
 _MM = 1000.0
 _FIT_MM, _CLEARLY = 1.0, 5.0
 """How well a robot's kinematics must fit the logged poses, and how much worse the next one must do it."""
@@ -51,11 +53,9 @@ def choose_robot(logs: list[ArmLog], note: Note) -> str:
     Raises:
         RecordingError: no poses beside the joints, or none of the robots fits clearly best.
     """
-    expected = f"--robot (one of {', '.join(DVRK_ROBOTS)}, or your robot.yaml)"
-    why = "joints alone do not tell a Classic arm from an S or Si, which is 50.8 mm along the shaft"
     both = [log for log in logs if len(log.joints) > 10 and len(log.poses) > 10 and len(log.joints[0]) == 6]
     if not both:
-        raise RecordingError(where="robot", expected=expected, found=f"no poses beside the joints: {why}")
+        raise RecordingError(where="robot", expected=NEEDS_ROBOT, found=NO_POSES)
     arms = {name: load_robot(name).arms["instrument"] for name in DVRK_ROBOTS}
     misfits = {name: _misfit_mm(both[0], arm) for name, arm in arms.items()}
     best = min(misfits.values())
@@ -64,7 +64,7 @@ def choose_robot(logs: list[ArmLog], note: Note) -> str:
     others = [misfit for name, misfit in misfits.items() if name not in same]
     if best > _FIT_MM or min(others, default=np.inf) < _CLEARLY * max(best, 0.02):
         found = ", ".join(f"{robot} off by {misfit:.3g} mm" for robot, misfit in misfits.items())
-        raise RecordingError(where="robot", expected=expected, found=f"no clear fit of the logged poses: {found}")
+        raise RecordingError(where="robot", expected=NEEDS_ROBOT, found=f"no clear fit of the logged poses: {found}")
     name = next((name for name in same if _within_limits(both[0], arms[name])), same[0])
     also = f"; {', '.join(other for other in same if other != name)} differs in limits only" if len(same) > 1 else ""
     note(f"robot: {name}, whose kinematics reproduce the poses of {both[0].name} to {best:.2g} mm{also}")

@@ -14,6 +14,7 @@ from rmis_calib.io.intrinsics import StereoFile
 ProgressCallback = Callable[[str, int, int], None]
 
 NS = 1_000_000_000
+NEEDS_STEREO = "--stereo FILE, the cameras' calibration (any format of `rmis-calib cameras show`)"
 
 
 @dataclass

@@ -6,8 +6,10 @@ from pathlib import Path
 from rmis_calib.convert.material import Job, ProgressCallback
 from rmis_calib.convert.settings import ConvertSettings
 from rmis_calib.convert.sources import read_source
+from rmis_calib.errors import FileError
 from rmis_calib.io.atomic import atomic_directory
 from rmis_calib.io.outputs import check_apart, check_folder
+from rmis_calib.io.robot import load_robot
 
 
 def convert(
@@ -42,6 +44,10 @@ def convert(
     inputs = [source, *(Path(path) for path in (settings.robot, settings.stereo) if path is not None)]
     check_apart(out, [path for path in inputs if path.exists()])
     check_folder(out.absolute(), overwrite)
+    if settings.robot is not None:
+        load_robot(settings.robot)
+    if settings.stereo is not None and not Path(settings.stereo).exists():
+        raise FileError(where=settings.stereo, expected="a camera calibration", found="nothing there")
     notes: list[str] = []
 
     def note(sentence: str) -> None:

@@ -12,6 +12,10 @@ from rmis_calib.io._checks import Note
 # Old (state_joint_current, position_cartesian_current) and new names; setpoints and goals are not measurements.
 _MEASURED_JOINTS = ("measured_js", "state_joint_current", "joint_states")
 _MEASURED_POSE = ("measured_cp", "position_cartesian_current", "position_cartesian_local_current")
+_NOT_MEASURED = re.compile(
+    r"setpoint|goal|servo|move|desired|command|cmd|reference|target|jaw|gripper|SUJ", re.IGNORECASE
+)
+"""Words of topics that do not say where an arm is."""
 _NOT_PICTURES = ("depth", "disparity", "mask", "side", "overlay", "debug", "theora")
 _ARM = re.compile(r"^(PSM|ECM|MTM|SUJ|arm|robot)\w*$", re.IGNORECASE)
 
@@ -55,8 +59,16 @@ def choose_topics(topics: Sequence[Topic], settings: ConvertSettings, note: Note
         info = None if picture is None else _info_of(picture, topics)
         if info is not None:
             infos[side] = info
-    joints = _by_arm(topics, (JOINT_STATE,), _MEASURED_JOINTS)
+    joints = _by_arm(topics, (JOINT_STATE,), _MEASURED_JOINTS) or _by_arm(topics, (JOINT_STATE,), None)
     poses = _by_arm(topics, POSES, _MEASURED_POSE)
+    if not joints and not poses:
+        poses = _by_arm(topics, POSES, None)
+    for arm, topic in {**poses, **joints}.items():
+        if topic.words[-1] not in (*_MEASURED_JOINTS, *_MEASURED_POSE):
+            note(f"{arm}: {topic.name}, by its type ({topic.type.rpartition('/')[2]})")
+    for topic in topics:
+        if "SUJ" in topic.words and topic.words[-1] == "measured_cp" and topic.type in POSES and topic.count:
+            note(f"{topic.name} is in the bag and was not used: set-up joints tell an arm's base to some 50 mm only")
     return Choice(right, left, infos, joints, poses)
 
 
@@ -65,14 +77,14 @@ def describe(topics: Sequence[Topic]) -> str:
     return ", ".join(f"{topic.name} ({topic.type.rpartition('/')[2]})" for topic in topics[:12]) or "nothing"
 
 
-def _by_arm(topics: Sequence[Topic], types: Sequence[str], names: Sequence[str]) -> dict[str, Topic]:
-    """Topics `.../ARM/[local/]name` by their arm; local ones win."""
+def _by_arm(topics: Sequence[Topic], types: Sequence[str], names: Sequence[str] | None) -> dict[str, Topic]:
+    """Topics `.../ARM/[local/]name` by their arm; local ones win. Without names: all that measure."""
     found: dict[str, Topic] = {}
     for topic in topics:
         words = topic.words
-        if topic.type not in types or not words or words[-1] not in names or not topic.count:
+        if topic.type not in types or not words or not topic.count or "SUJ" in words or "jaw" in words:
             continue
-        if "SUJ" in words or "jaw" in words or "gripper" in words:
+        if _NOT_MEASURED.search(topic.name) if names is None else words[-1] not in names:
             continue
         path = [word for word in words[:-1] if word not in ("local", "dvrk", "body", "spatial")]
         arm = next((word for word in path if _ARM.match(word)), path[-1] if path else words[-1])

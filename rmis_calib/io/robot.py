@@ -41,7 +41,9 @@ def robot_to_dict(robot: Robot) -> dict:
 
 
 def _arm_to_dict(arm: Arm) -> dict:
-    content: dict = {"base_T_arm_base": np.asarray(arm.base_T_arm_base).tolist(), "joints": []}
+    stated = arm.base_T_arm_base is not None
+    content: dict = {"base_T_arm_base": np.asarray(arm.base_T_arm_base).tolist()} if stated else {}
+    content["joints"] = []
     for joint in arm.joints:
         row = {key: getattr(joint, key) for key in ("name", "type", "alpha_rad", "a_mm", "theta_rad", "d_mm", "offset")}
         limits = {} if joint.min is None else {"min": joint.min, "max": joint.max}

@@ -11,6 +11,7 @@ from bag_writing import RIG, START_S, BagWriter, read_recording, to_ns, write_ba
 
 from rmis_calib.cli import main
 from rmis_calib.convert import ConvertSettings, convert
+from rmis_calib.convert.topics import Choice, Topic, choose_topics
 from rmis_calib.errors import FileError, RecordingError
 from rmis_calib.io.recording import load_recording
 
@@ -188,6 +189,29 @@ def test_pairs_drop_what_has_no_partner(rendered: Path, tmp_path: Path) -> None:
             assert cv2.imread(str(tmp_path / "out" / side / f"{number:06d}.png"))[0, 0, 0] == 10 * i
 
 
+def test_a_gap_in_one_arms_log_is_not_bridged(rendered: Path, tmp_path: Path) -> None:
+    times, _, rows, _ = read_recording(rendered)
+    picture = cv2.imread(str(rendered / "right" / "000000.png"))
+    gap = (rows[:, 0] > 1.6) & (rows[:, 0] < 2.4)
+    with BagWriter(tmp_path / "a.bag", "ros1") as writer:
+        for row, is_gap in zip(rows, gap, strict=True):
+            names, metres = ["yaw", "pitch", "insertion"], np.array([1, 1, 1e-3])
+            writer.joints("/PSM1/measured_js", to_ns(row[0]), names, row[4:7] * metres)
+            if not is_gap:  # and at other times than the instrument's
+                writer.joints("/ECM/measured_js", to_ns(row[0]) + 1_000_000, names, row[1:4] * metres)
+        for time_s in times:
+            for side in ("right", "left"):
+                writer.image(f"{RIG}/{side}/image_raw", to_ns(time_s), picture, "rgb8")
+    notes = convert(tmp_path / "a.bag", tmp_path / "out", settings(rendered, stereo=str(rendered / "stereo.yaml")))
+    _, _, found, _ = read_recording(tmp_path / "out")
+    inside = (found[:, 0] + 1 > 1.65) & (found[:, 0] + 1 < 2.35)
+    assert not inside.any() and len(found) > 0.5 * len(rows)
+    assert any("one arm's log has a gap there" in note for note in notes)
+    recording = load_recording(tmp_path / "out")
+    valid = recording.joints_at_frames(recording.laparoscope_arm)[1]
+    assert not valid[(times > 1.7) & (times < 2.3)].any() and valid.any()
+
+
 def test_what_a_bag_lacks_is_said(rendered: Path, tmp_path: Path) -> None:
     times, _, rows, _ = read_recording(rendered)
     picture = cv2.imread(str(rendered / "right" / "000000.png"))
@@ -205,6 +229,7 @@ def test_what_a_bag_lacks_is_said(rendered: Path, tmp_path: Path) -> None:
                 writer.image("/camera/image_raw", to_ns(time_s), picture, "rgb8")
         return tmp_path / name
 
+    stereo, mono = str(rendered / "stereo.yaml"), str(mono_file(rendered, tmp_path))
     cases = [
         (
             bag("a.bag", joints=False),
@@ -212,10 +237,18 @@ def test_what_a_bag_lacks_is_said(rendered: Path, tmp_path: Path) -> None:
             "expected measured_js or measured_cp of an instrument's arm, found /camera/image_raw",
         ),
         (bag("b.bag", joints=True, images=False), {}, "expected pictures"),
-        (bag("c.bag", joints=True), {"robot": None}, "joints alone do not tell a Classic arm from an S or Si"),
+        (
+            bag("c.bag", joints=True),
+            {"robot": None, "stereo": stereo},
+            "alone do not tell a Classic arm from an S or Si",
+        ),
         (bag("d.bag", joints=True), {}, "expected --stereo FILE"),
-        (bag("e.bag", joints=False, poses=True), {}, "expected measured_js, or local/measured_cp, of PSM1"),
-        (bag("f.bag", joints=True), {"instrument": "PSM2"}, "expected a log of PSM2, found PSM1"),
+        (
+            bag("e.bag", joints=False, poses=True),
+            {"stereo": mono},
+            "expected measured_js, or local/measured_cp, of PSM1",
+        ),
+        (bag("f.bag", joints=True), {"instrument": "PSM2", "stereo": mono}, "expected a log of PSM2, found PSM1"),
         (bag("g.bag", joints=True), {"right_topic": "/nowhere"}, "expected pictures on topic /nowhere"),
     ]
     for path, change, message in cases:
@@ -256,3 +289,38 @@ def test_the_output_may_not_lie_in_the_source(
     (tmp_path / "other" / "mine.txt").write_text("a person's")
     assert main(command) == 2
     assert sorted(path.name for path in (tmp_path / "other").iterdir()) == sorted([*before, "mine.txt"])
+
+
+def test_topics_by_structure() -> None:
+    joint, pose, image = "sensor_msgs/msg/JointState", "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/Image"
+    info = "sensor_msgs/msg/CameraInfo"
+    notes: list[str] = []
+
+    def chosen(*topics: tuple[str, str]) -> Choice:
+        return choose_topics([Topic(name, kind, 5) for name, kind in topics], ConvertSettings(), notes.append, "bag")
+
+    old = chosen(("/dvrk/PSM1/state_joint_current", joint), ("/dvrk/PSM1/state_jaw_current", joint))
+    assert {arm: topic.name for arm, topic in old.joints.items()} == {"PSM1": "/dvrk/PSM1/state_joint_current"}
+    local = chosen(
+        ("/PSM1/measured_cp", pose),
+        ("/PSM1/local/measured_cp", pose),
+        ("/PSM1/setpoint_cp", pose),
+        ("/SUJ/PSM1/measured_cp", pose),
+    )
+    assert {arm: topic.name for arm, topic in local.poses.items()} == {"PSM1": "/PSM1/local/measured_cp"}
+    assert any("/SUJ/PSM1/measured_cp is in the bag and was not used" in note for note in notes)
+    other = chosen(("/lbr/joints", joint), ("/lbr/command_joints", joint))
+    assert {arm: topic.name for arm, topic in other.joints.items()} == {"lbr": "/lbr/joints"}
+    assert any("lbr: /lbr/joints, by its type (JointState)" in note for note in notes)
+    rig = chosen(
+        ("/r/left/image_rect_color", image), ("/r/right/image_rect_color", image), ("/r/left/image_raw", image),
+        ("/r/right/image_raw", image), ("/r/left/camera_info", info), ("/r/right/camera_info", info),
+        ("/r/depth/right", image),
+    )  # fmt: skip
+    assert rig.right is not None and rig.left is not None
+    assert (rig.right.name, rig.left.name) == ("/r/right/image_raw", "/r/left/image_raw")
+    assert {side: topic.name for side, topic in rig.infos.items()} == {
+        "right": "/r/right/camera_info", "left": "/r/left/camera_info",
+    }  # fmt: skip
+    with pytest.raises(RecordingError, match="since several fit"):
+        chosen(("/a/left/image", image), ("/a/right/image", image), ("/b/left/image", image), ("/b/right/image", image))
