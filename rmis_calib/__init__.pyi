@@ -18,6 +18,8 @@ from .geometry import residuals as residuals
 from .io import Recording as Recording
 from .io import ShaftObservations as ShaftObservations
 from .io import load_recording as load_recording
+from .live import LiveAnswer as LiveAnswer
+from .live import Session as Session
 from .pipeline import (
     calibrate as calibrate,
 )

@@ -8,6 +8,7 @@ import torch
 
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.errors import InsufficientDataError
+from rmis_calib.geometry.rigid import RigidTransform
 from rmis_calib.io import Recording, ShaftObservations
 from rmis_calib.pipeline.advice import with_next_motions
 from rmis_calib.pipeline.association import Choice, associate, association_gate, consistent_choice, read_prior
@@ -73,6 +74,29 @@ def run_calibration(
     prior = read_prior(config)
     poses = motion_poses(recording, config.device)
     views, notes = _detect(recording, config, poses, progress, segment)
+    return calibrate_views(recording, config, poses, views, prior, notes, progress)
+
+
+def calibrate_views(
+    recording: Recording,
+    config: CalibrationConfig,
+    poses: MotionPoses,
+    views: tuple[View, ...],
+    prior: RigidTransform | None = None,
+    notes: tuple[str, ...] = (),
+    progress: Progress = no_progress,
+) -> CalibrationRun:
+    """The calibration from shafts that are detected already.
+
+    Args:
+        recording: cameras, arms and joints.
+        config: the configuration.
+        poses: kinematics of the motions.
+        views: detections of every frame, one entry a camera.
+        prior: from `read_prior`.
+        notes: on what was detected.
+        progress: called with (stage, done, total).
+    """
     attempts, several = associate(recording, config, poses, views, prior)
     checked = (*about_motions(recording, poses, config), *about_order(recording, poses, views, attempts[0]))
     notes += tuple(f"{finding.topic}: {finding.sentence}" for finding in checked if finding.is_doubt)

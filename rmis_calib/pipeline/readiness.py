@@ -152,6 +152,11 @@ def _rough(
     known = torch.as_tensor(np.isin(poses.frames, looked), device=poses.arm_T_rcm.device)
     few = poses.select(known)
     attempts, _ = associate(recording, config, few, views, read_prior(config))
+    return solve_choices(recording, quick(config), views, few, attempts, no_progress)
+
+
+def quick(config: CalibrationConfig) -> CalibrationConfig:
+    """The configuration of a rough estimate: nominal noise, no offsets, none of the checks."""
     solver = config.solver
     plain = replace(
         solver,
@@ -160,7 +165,7 @@ def _rough(
         groups=0,
         bias_correction=False,
     )
-    return solve_choices(recording, replace(config, solver=plain), views, few, attempts, no_progress)
+    return replace(config, solver=plain)
 
 
 def _expected(run: CalibrationRun, config: CalibrationConfig) -> tuple[Finding, tuple[float | None, float | None]]:

@@ -60,6 +60,7 @@ def test_contracts_say_what_the_design_says() -> None:
     rows = [[name.strip(" ()") for name in row.split("|")] for row in layers]
     assert rows == [
         ["cli"],
+        ["live"],
         ["batches", "convert", "exports", "studies", "viewer"],
         ["report", "parallel"],
         ["pipeline"],

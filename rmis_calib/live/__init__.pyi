@@ -1,0 +1,2 @@
+from .session import LiveAnswer as LiveAnswer
+from .session import Session as Session

@@ -1,0 +1,291 @@
+"""`rc.Session`: add a frame and joints, get the answer so far and the next useful motion.
+
+Between solves of all motions each new one moves the estimate by one step of an information filter. A live answer is
+never `ok`: it counts nominal noise and encoders without offsets. `result` solves everything and checks it.
+"""
+
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from rmis_calib.config import CalibrationConfig
+from rmis_calib.errors import InputError
+from rmis_calib.geometry.cameras import StereoRig
+from rmis_calib.geometry.rigid import RigidTransform, rigid_from_rotation_translation, rigid_inverse
+from rmis_calib.io import Recording, load_recording
+from rmis_calib.io.robot import load_robot
+from rmis_calib.kinematics import RobotKinematics
+from rmis_calib.live.collected import Collected
+from rmis_calib.pipeline.advice import with_next_motions
+from rmis_calib.pipeline.association import associate, consistent_choice, read_prior
+from rmis_calib.pipeline.calibration import calibrate_views, solve_choices
+from rmis_calib.pipeline.detection import no_progress
+from rmis_calib.pipeline.observations import DIRECTION_UNKNOWN, assemble, problem_of
+from rmis_calib.pipeline.poses import MotionPoses, predict_contours
+from rmis_calib.pipeline.readiness import quick
+from rmis_calib.pipeline.run import CalibrationRun
+from rmis_calib.results import CalibrationResult
+from rmis_calib.robot import Robot
+from rmis_calib.solver import Problem
+from rmis_calib.solver.assess.information import inverse
+from rmis_calib.solver.assess.observability import assess
+from rmis_calib.solver.assess.update import add_motion
+from rmis_calib.solver.observability import Verdict
+from rmis_calib.solver.solution import Posterior
+from rmis_calib.vision import FrameReason, ShaftDetections, ShaftDetector
+
+SOLVE_AGAIN = 1.5
+"""All motions are solved again when there are this many times more than at the last solve..."""
+CONTRADICTIONS = 3
+"""...or when this many frames in a row contradict the estimate."""
+CANDIDATES = 128
+"""Random motions among which the next one is chosen: a tenth of what a calibration tries."""
+
+LiveStatus = Literal["collecting", "weak", "ready"]
+
+
+@dataclass(frozen=True)
+class LiveAnswer:
+    """What is known after a frame.
+
+    Attributes:
+        status: `collecting` (no estimate yet), `weak`, or `ready`: `result` is expected to be trustworthy.
+        message: one line: why.
+        frames: frames so far; used: those that show the shaft and agree.
+        frame_used: whether the last one did; frame_reason: why not, else empty.
+        camera_right_T_arm: the estimate, mm; None while collecting.
+        covariance: (6, 6) as in a result, for nominal noise and encoders without offsets.
+        advice: the motions that would help most, in words, as far as they are computed (`Session.advice` waits).
+    """
+
+    status: LiveStatus
+    message: str
+    frames: int
+    used: int
+    frame_used: bool
+    frame_reason: str
+    camera_right_T_arm: RigidTransform | None = None
+    covariance: Float[np.ndarray, "6 6"] | None = None
+    advice: tuple[str, ...] = ()
+
+
+class Session:
+    """A calibration that grows with every still pose.
+
+    Args:
+        robot: a description, or the name of a preset.
+        stereo: the cameras; `StereoRig(right)` for one.
+        laparoscope_arm: name of the arm that carries the camera; None where it stands still.
+        instrument_arm: name of the instrument's arm.
+        shaft_diameter_mm: of the shaft.
+        config: as for `calibrate`.
+    Raises:
+        RobotError: the robot cannot carry these arms.
+    """
+
+    def __init__(
+        self,
+        robot: Robot | str,
+        stereo: StereoRig,
+        *,
+        laparoscope_arm: str | None = "laparoscope",
+        instrument_arm: str = "instrument",
+        shaft_diameter_mm: float = 8.0,
+        config: CalibrationConfig | None = None,
+    ) -> None:
+        self._config = config or CalibrationConfig()
+        described = load_robot(robot) if isinstance(robot, str) else robot
+        self._kinematics = RobotKinematics(described, laparoscope_arm, instrument_arm, device=self._config.device)
+        self._collected = Collected(described, stereo, laparoscope_arm, instrument_arm, shaft_diameter_mm)
+        self._detectors = {
+            side: ShaftDetector(self._config.detector, camera.to(torch.float64, self._config.device))
+            for side, camera in self._collected.cameras().items()
+        }
+        self._executor = ThreadPoolExecutor(len(self._detectors) + 1, thread_name_prefix="rmis-session")
+        self._run: CalibrationRun | None = None
+        self._posterior: Posterior | None = None
+        self._problem: Problem | None = None
+        self._advising: Future[tuple[str, ...]] | None = None
+        self._advice: tuple[str, ...] = ()
+        self._solved, self._used, self._contradictions = 0, 0, 0
+        advice = replace(self._config.solver.advice, candidates=CANDIDATES)
+        self._quick = quick(replace(self._config, solver=replace(self._config.solver, advice=advice)))
+
+    @classmethod
+    def like(cls, recording: Recording | str | Path, config: CalibrationConfig | None = None) -> "Session":
+        """A session with the robot and the cameras of a recording, and none of its frames."""
+        known = recording if isinstance(recording, Recording) else load_recording(recording)
+        return cls(
+            known.robot,
+            known.stereo,
+            laparoscope_arm=known.laparoscope_arm,
+            instrument_arm=known.instrument_arm,
+            shaft_diameter_mm=known.shaft_diameter_mm,
+            config=config,
+        )
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Joints that every frame needs: `<arm>.<joint>_rad` or `_mm`."""
+        return self._collected.columns
+
+    def add(
+        self,
+        joints: Mapping[str, float],
+        right: UInt8[Tensor, "3 h w"],
+        left: UInt8[Tensor, "3 h w"] | None = None,
+    ) -> LiveAnswer:
+        """One frame of arms at rest.
+
+        Args:
+            joints: readings of `columns`, rad and mm.
+            right, left: RGB pictures of the cameras.
+        Raises:
+            InputError: a joint is missing or unknown, or a picture of a camera is.
+            ShapeError: a picture of another size than its camera's.
+        """
+        readings = self._collected.readings_of(joints)
+        pictures = {"right": right} | ({} if left is None else {"left": left})
+        if set(pictures) != set(self._detectors):
+            expected = " and ".join(f"a {side} picture" for side in self._detectors)
+            raise InputError(where="pictures", expected=expected, found=" and ".join(pictures))
+        jobs = {side: self._executor.submit(self._detectors[side].detect, images[None].to(self._config.device))
+                for side, images in pictures.items()}  # fmt: skip
+        poses = self._poses(readings)
+        found = {side: job.result() for side, job in jobs.items()}
+        self._collected.add(readings, poses, found)
+        reason = _reason(found)
+        if not reason:
+            reason = self._take(poses, found)
+        return self._answer(reason)
+
+    def advice(self) -> tuple[str, ...]:
+        """The motions that would help most, in words; waits for them where they are being computed."""
+        if self._advising is not None:
+            self._advising.result()
+        return self._known_advice()
+
+    def result(self) -> CalibrationResult:
+        """Everything so far solved with all checks, as `calibrate` does; takes seconds.
+
+        A session has no log of motion: the clock is not estimated.
+        """
+        if not len(self._collected):
+            raise InputError(where="session", expected="frames", found="none")
+        recording, poses, views = self._collected.recording(), self._collected.poses(), self._collected.views()
+        return calibrate_views(recording, self._config, poses, views, read_prior(self._config)).result
+
+    def _poses(self, readings: Float[np.ndarray, " j"]) -> MotionPoses:
+        values = torch.as_tensor(readings, device=self._config.device)[None]
+        split = len(self._kinematics.laparoscope_joints)
+        instrument = self._kinematics.instrument(values[:, split:])
+        base_T_arm = self._kinematics.base_T_arm(values[:, :split])
+        arm_T_rcm = rigid_inverse(base_T_arm) @ instrument.base_T_rcm
+        return MotionPoses(
+            np.zeros(1, dtype=int), arm_T_rcm, instrument.rcm_v_axis, instrument.rcm_s_end_mm, instrument.rcm_p_head
+        )
+
+    def _take(self, poses: MotionPoses, found: dict[str, ShaftDetections]) -> str:
+        """Let the last frame move the estimate; why it does not, else nothing."""
+        self._used += 1
+        if self._posterior is None or self._used >= SOLVE_AGAIN * self._solved:
+            return self._solve_all()
+        self._posterior, taken = add_motion(self._posterior, self._problem_of(poses, found), self._quick.solver)
+        if bool(taken.all()):
+            self._contradictions = 0
+            return ""
+        self._contradictions += 1
+        if self._contradictions >= CONTRADICTIONS:
+            return self._solve_all()
+        self._used -= 1
+        return "it contradicts the estimate so far: did the arms move, or is it another instrument?"
+
+    def _solve_all(self) -> str:
+        """Solve all motions so far; why the last frame is not among them, else nothing."""
+        if self._used < self._config.min_motions:
+            return ""
+        recording, poses, views = self._collected.recording(), self._collected.poses(), self._collected.views()
+        attempts, _ = associate(recording, self._quick, poses, views, read_prior(self._config))
+        run = solve_choices(recording, self._quick, views, poses, attempts, no_progress)
+        self._run, self._contradictions, self._posterior, self._problem = run, 0, None, None
+        if run.solution is not None and run.observations is not None and run.result.status != "solver_failed":
+            self._posterior = run.solution.posterior
+            self._problem = problem_of(run.observations, self._quick).flatten_batch()
+            # Ten times as long as the solve: it goes on while the arms move to their next place.
+            self._advising = self._executor.submit(_advice, run, self._quick)
+        self._used = self._solved = max(int(run.result.motions.used.sum()), 1)
+        return "" if run.result.motions.used[-1] else run.result.motions.reasons[-1]
+
+    def _problem_of(self, poses: MotionPoses, found: dict[str, ShaftDetections]) -> Problem:
+        """The last frame's measurements, of the candidate nearest to where the estimate puts the shaft."""
+        assert self._posterior is not None and self._run is not None
+        state = self._posterior.state
+        camera_T_arm = {"right": rigid_from_rotation_translation(state.R, state.t)[0]}
+        if "left" in found:
+            camera_left_T_camera_right = rigid_from_rotation_translation(state.stereo_R, state.stereo_t)[0]
+            camera_T_arm["left"] = camera_left_T_camera_right @ camera_T_arm["right"]
+        radius_mm = float(state.radius.reshape(-1)[0])
+        views = tuple(self._collected.view(side, [detections]) for side, detections in found.items())
+        # Three times the same motion, of which one is kept: observations of fewer than three are refused.
+        thrice = _repeated(poses, 3)
+        choices = tuple(
+            consistent_choice(view.at(thrice.frames), predict_contours(camera_T_arm[view.side], thrice, radius_mm))
+            for view in views
+        )
+        observations = assemble(self._run.recording, thrice, views, choices, self._quick)
+        return problem_of(observations, self._quick).select_motions(slice(0, 1))
+
+    def _known_advice(self) -> tuple[str, ...]:
+        """The advice of the last solve whose advice is there."""
+        if self._advising is not None and self._advising.done():
+            self._advice = self._advising.result()
+        return self._advice
+
+    def _answer(self, reason: str) -> LiveAnswer:
+        """What is known now; `reason` says why the last frame does not count."""
+        common = (len(self._collected), self._used, not reason, reason)
+        if self._posterior is None or self._run is None or self._run.solution is None or self._problem is None:
+            why = f"{self._used} usable motions, {self._config.min_motions} are needed"
+            if self._run is not None:
+                why = self._run.result.message
+            return LiveAnswer("collecting", why, *common)
+        posterior, state = self._posterior, self._posterior.state
+        covariance = inverse(posterior.information)[:, :6, :6]
+        flags, verdict = self._run.solution.observability.degeneracy, self._quick.solver.verdict
+        seen = assess(self._problem, state.R, state.t, covariance, verdict, flags)
+        matrix = rigid_from_rotation_translation(state.R, state.t)[0].detach().cpu()
+        return LiveAnswer(
+            "ready" if Verdict.of(seen.verdict[0]) is Verdict.TRUSTWORTHY else "weak",
+            seen.describe().sentences[0],
+            *common,
+            RigidTransform("camera_right", "arm", matrix),
+            covariance[0].cpu().numpy(),
+            self._known_advice(),
+        )
+
+
+def _advice(run: CalibrationRun, config: CalibrationConfig) -> tuple[str, ...]:
+    return tuple(with_next_motions(run, config).result.observability.advice or ())
+
+
+def _repeated(poses: MotionPoses, times: int) -> MotionPoses:
+    """One motion several times."""
+    tensors = {
+        name: value.repeat_interleave(times, 0) for name, value in vars(poses).items() if isinstance(value, Tensor)
+    }
+    return MotionPoses(frames=np.repeat(poses.frames, times), **tensors)
+
+
+def _reason(found: dict[str, ShaftDetections]) -> str:
+    """Why no camera shows a shaft; empty where one does."""
+    if any(bool((detections.valid & detections.direction_known).any()) for detections in found.values()):
+        return ""
+    code = FrameReason(int(next(iter(found.values())).reason[0]))
+    return DIRECTION_UNKNOWN if code is FrameReason.OK else code.sentence
