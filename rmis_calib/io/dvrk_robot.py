@@ -207,7 +207,7 @@ def _rows(value: Any, where: str) -> list[list[float]]:
     try:
         matrix = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
-        matrix = np.empty(0)
+        matrix = np.empty((0, 0))
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise RobotError(where=where, expected="a transform of 4 rows of 4 finite numbers", found="something else")
     return [[float(value) for value in row] for row in matrix]
