@@ -26,6 +26,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "evaluate": ("Evaluate", "measure a result against head points and against a truth file"),
     "convert": ("Convert", "make a recording of a ROS bag, a dVRK session, a data set, or pictures with a table"),
     "view": ("View", "show arms, cameras, shaft and uncertainty in a browser, motion by motion"),
+    "info": ("Info", "print versions, devices and paths, for a bug report"),
     "cameras show": ("CamerasShow", "print a camera file of any known format as stereo.yaml, and draw it"),
     "robots list": ("RobotsList", "list the shipped robots"),
     "robots show": ("RobotsShow", "print a robot as robot.yaml"),

@@ -25,6 +25,7 @@ from rmis_calib.cli.equipment import RobotsCheck as RobotsCheck
 from rmis_calib.cli.equipment import RobotsImport as RobotsImport
 from rmis_calib.cli.equipment import RobotsList as RobotsList
 from rmis_calib.cli.equipment import RobotsShow as RobotsShow
+from rmis_calib.cli.info import Info as Info
 from rmis_calib.cli.paths import beside, check_output_folder, setting_inputs
 from rmis_calib.cli.study_commands import parse_study
 from rmis_calib.cli.usage import parse_arguments

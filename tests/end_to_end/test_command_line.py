@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -120,3 +121,10 @@ def test_exit_code_of_an_ok_result_that_nobody_reads(demo_output, tmp_path) -> N
     os.close(writer)
     assert (result.returncode, result.stderr) == (0, "")
     assert (tmp_path / "result.json").is_file()
+
+
+def test_info_names_the_versions(capsys) -> None:
+    assert main(["info"]) == 0
+    shown = capsys.readouterr().out
+    assert version("rmis-calib") in shown
+    assert version("torch") in shown
