@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test lint bench docs clean
+.PHONY: demo test lint bench bench-check docs clean
 .DEFAULT_GOAL := demo
 
 $(STAMP): pyproject.toml
@@ -17,7 +17,7 @@ demo: $(STAMP)  ## render a stereo recording, calibrate it, leave demo_output/re
 	$(BIN)/rmis-calib demo --out demo_output --overwrite
 
 test: $(STAMP)  ## every test, the import contracts and the documentation's Python
-	$(BIN)/python -m pytest -q -n auto --dist loadfile
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n auto --dist loadfile
 
 lint: $(STAMP)  ## ruff and pyright
 	$(BIN)/ruff format --check .
@@ -26,6 +26,9 @@ lint: $(STAMP)  ## ruff and pyright
 
 bench: $(STAMP)  ## every table that the documentation quotes (long)
 	set -e; for f in tests/benchmarks/bench_*.py; do echo "== $$f"; $(BIN)/python $$f; done
+
+bench-check: $(STAMP)  ## a few minutes of benchmarks against tests/benchmarks/baseline.json
+	$(BIN)/python tests/benchmarks/check.py
 
 docs: $(STAMP)  ## the documentation as a site that opens from disk: build/site/index.html
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'

@@ -15,21 +15,19 @@ from rmis_calib.batches.summary import PAGE, BatchSummary, end_of
 from rmis_calib.batches.task import RECORD, JobRecord
 from rmis_calib.io.atomic import atomic_write
 from rmis_calib.io.outputs import check_file, is_report
-from rmis_calib.report.content import Pose, pose
+from rmis_calib.report.content import HEADLINES, Headline, Pose, pose
 from rmis_calib.report.formatting import UNKNOWN, significant
 from rmis_calib.report.page import template
 from rmis_calib.report.plots import plot_repeatability
 
 _ENDS = {
-    "failed": ("bad", "Failed", 0),
-    "solver_failed": ("bad", "No solution", 1),
-    "unobservable": ("bad", "Not observable", 2),
-    "insufficient_data": ("bad", "Not enough data", 3),
-    "weak": ("weak", "Weak", 4),
-    "ok": ("ok", "Trustworthy", 5),
-    "found": ("open", "Detected", 5),
+    "failed": Headline("bad", "Failed"),
+    **HEADLINES,
+    "found": Headline("open", "Detected"),
+    "not done": Headline("open", "Not done"),
 }
-"""Tone, words and rank of each way in which a job can end; what needs a look comes first."""
+"""Each way in which a job can end; what needs a look comes first."""
+_RANKS = {end: rank for rank, end in enumerate(_ENDS)}
 _RESIDUALS = ("residual_contour_right_px", "residual_contour_left_px")
 
 
@@ -100,7 +98,7 @@ def write_index(folder: Path, summary: BatchSummary, title: str) -> None:
         version=__version__,
         tone="ok" if summary.trustworthy else "weak",
         verdict=_verdict(summary),
-        counts=[(end, *_ENDS.get(end, ("open", end, 9))[:2], count) for end, count in summary.counts.items()],
+        counts=[(end, _end(end).tone, _end(end).word, count) for end, count in summary.counts.items()],
         rows=rows,
         headings=HEADINGS,
         setups=[_setup(setup) for setup in summary.setups],
@@ -120,9 +118,14 @@ def _verdict(summary: BatchSummary) -> str:
     return f"{total - good} of {total} recordings need a look"
 
 
+def _end(end: str) -> Headline:
+    """How a job ended, in words; an end this page does not know, of a later version, counts as bad."""
+    return _ENDS.get(end, Headline("bad", end))
+
+
 def _row(folder: Path, record: JobRecord) -> PageRow:
     end = end_of(record)
-    tone, word, rank = _ENDS.get(end, ("bad", end, 1))
+    verdict = _end(end)
     row = record.row
     target = folder / PurePosixPath(record.name)
     page = next((name for name in ("report.html", "lines.csv", RECORD) if (target / name).is_file()), None)
@@ -142,9 +145,9 @@ def _row(folder: Path, record: JobRecord) -> PageRow:
         name=record.name,
         link="" if page is None else quote(f"{record.name}/{page}"),
         thumbnail=_embedded(target / "thumbnail.jpg"),
-        tone=tone,
-        word=word,
-        rank=rank,
+        tone=verdict.tone,
+        word=verdict.word,
+        rank=_RANKS.get(end, 0),
         end=end,
         message=record.message,
         notes=tuple(row.get("notes") or ()),

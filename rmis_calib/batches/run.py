@@ -202,7 +202,7 @@ def _one_round(
     not_done = tuple(order.job.name for order in orders if order.job.name not in records)
     kept = sorted(records.values(), key=lambda record: natural_order(record.name))
     summary = BatchSummary(
-        tuple(kept), _setups(out, kept), now.left_out, tuple(record.name for record in now.done), not_done
+        tuple(kept), setups_of(out, kept), now.left_out, tuple(record.name for record in now.done), not_done
     )
     if orders or not (out / PAGE).exists() or not settings.watch:
         summary.write(out)
@@ -254,6 +254,7 @@ def _work(
             elif event.kind == "finished":
                 record = _seen_from_here(order, event.value)
             elif event.kind == "died":
+                _clear_remains(order.target)  # the dead process could not
                 times = f" in each of {event.attempt} attempts" if event.attempt > 1 else ""
                 record = write_failure(order, "crash", f"{event.value}{times}")
             if record is not None:
@@ -329,7 +330,7 @@ def _spread_over_gpus(orders: list[Order]) -> list[Order]:
     return [replace(order, job=with_device(order.job, f"cuda:{i % count}")) for i, order in enumerate(orders)]
 
 
-def _setups(out: Path, records: Sequence[JobRecord]) -> tuple[SetupComparison, ...]:
+def setups_of(out: Path, records: Sequence[JobRecord]) -> tuple[SetupComparison, ...]:
     """Comparisons of the recordings of each set-up."""
     by_setup: dict[str, list[JobRecord]] = {}
     for record in records:

@@ -197,8 +197,8 @@ def _calibrate(order: Order, folder: Path, log: "StageLog") -> tuple[str, dict[s
     log("reading", 1, 1)
     run = run_calibration(recording, order.job.config, log)
     log("writing", 0, 1)
-    write_calibration_folder(folder, run, order.overlays, order.overlay_video)
-    write_thumbnail(folder / "thumbnail.jpg", run)
+    drawn = write_calibration_folder(folder, run, order.overlays, order.overlay_video)
+    write_thumbnail(folder / "thumbnail.jpg", drawn)
     log("writing", 1, 1)
     for note in run.result.notes:
         log.note("note", text=note)
@@ -253,18 +253,20 @@ def row_of_result(result: "CalibrationResult") -> dict[str, Any]:
 
 
 def setup_of(description: "RecordingDescription") -> str:
-    """Name of a robot with its cameras and arms: recordings of one set-up have one hand-eye transform."""
+    """Name of a robot with its cameras, arms and shaft: recordings of one set-up have one hand-eye transform, and
+    share the deviation of the shaft's radius from the one that was told."""
     import hashlib
 
-    robot, stereo = description.robot, description.stereo
+    robot, stereo, diameter_mm = description.robot, description.stereo, description.shaft_diameter_mm
     arms = {
         name: asdict(robot.arms[name]) for name in (description.laparoscope_arm, description.instrument_arm) if name
     }
-    content = [robot.name, robot.dh_convention, arms, asdict(stereo), description.laparoscope_arm]
+    content = [robot.name, robot.dh_convention, arms, asdict(stereo), description.laparoscope_arm, diameter_mm]
     text = json.dumps(content, sort_keys=True, default=lambda array: array.tolist())
     height, width = stereo.right.image_size
     cameras = "stereo" if stereo.left is not None else "mono"
-    return f"{robot.name}, {cameras} {width} x {height}, {hashlib.blake2b(text.encode(), digest_size=3).hexdigest()}"
+    digest = hashlib.blake2b(text.encode(), digest_size=3).hexdigest()
+    return f"{robot.name}, {cameras} {width} x {height}, {diameter_mm:g} mm shaft, {digest}"
 
 
 class StageLog:

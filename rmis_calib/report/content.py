@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,16 +22,18 @@ class Headline:
 
     tone: str
     word: str
-    sentence: str
+    advice: str = ""
+    sentence: str = ""
 
 
-_HEADLINES = {
-    "ok": ("ok", "Trustworthy"),
-    "weak": ("weak", "Weak: do not rely on it"),
-    "unobservable": ("bad", "Not observable: do not use"),
-    "solver_failed": ("bad", "No solution"),
-    "insufficient_data": ("bad", "Not enough data"),
+HEADLINES = {
+    "solver_failed": Headline("bad", "No solution"),
+    "unobservable": Headline("bad", "Not observable", "do not use"),
+    "insufficient_data": Headline("bad", "Not enough data"),
+    "weak": Headline("weak", "Weak", "do not rely on it"),
+    "ok": Headline("ok", "Trustworthy"),
 }
+"""Of each status, what needs a look most first."""
 _TONES = {Verdict.TRUSTWORTHY: "ok", Verdict.WEAK: "weak", Verdict.UNOBSERVABLE: "bad", None: "open"}
 
 
@@ -110,8 +112,8 @@ class Row:
 
 
 def headline(result: CalibrationResult) -> Headline:
-    """The verdict in a word and a sentence."""
-    return Headline(*_HEADLINES[result.status], STATUS_SENTENCES[result.status])
+    """The verdict in words and a sentence."""
+    return replace(HEADLINES[result.status], sentence=STATUS_SENTENCES[result.status])
 
 
 def pose(name: str, transform: RigidTransform | None) -> Pose | None:

@@ -15,6 +15,7 @@ from rmis_calib.pipeline.detection import DetectionTable, Progress, View, no_pro
 from rmis_calib.pipeline.run import CalibrationRun
 from rmis_calib.report.detection_pictures import write_picture
 from rmis_calib.report.overlay_video import write_overlay_videos
+from rmis_calib.report.overlays import Overlay
 from rmis_calib.report.page import write_report
 from rmis_calib.report.pictures import overlays, spread
 from rmis_calib.results import CalibrationResult
@@ -62,8 +63,9 @@ def calibrate_to_folder(
     return run.result
 
 
-def write_calibration_folder(folder: Path, run: CalibrationRun, count: int, video: bool = False) -> None:
-    """result.json, config.yaml, observations.npz, overlays/*.jpg, report.html and, where asked for, overlay_*.mp4.
+def write_calibration_folder(folder: Path, run: CalibrationRun, count: int, video: bool = False) -> tuple[Overlay, ...]:
+    """result.json, config.yaml, observations.npz, overlays/*.jpg, report.html and, where asked for, overlay_*.mp4;
+    returns the pictures that the report shows.
 
     Args:
         folder: existing folder.
@@ -95,6 +97,7 @@ def write_calibration_folder(folder: Path, run: CalibrationRun, count: int, vide
     )
     if video:
         write_overlay_videos(folder, run)
+    return tuple(in_page)
 
 
 def write_lines(folder: Path, table: DetectionTable) -> None:

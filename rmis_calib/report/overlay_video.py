@@ -1,5 +1,6 @@
 """A calibration as a video: every motion with its contours, its residual and the verdict; and its smallest picture."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -7,6 +8,7 @@ import numpy as np
 
 from rmis_calib.io.video_writing import OverlayVideo
 from rmis_calib.pipeline.run import CalibrationRun
+from rmis_calib.report.content import headline
 from rmis_calib.report.detection_pictures import playing_rate_hz
 from rmis_calib.report.overlays import Overlay
 from rmis_calib.report.pictures import overlays
@@ -19,8 +21,7 @@ _BAR_PX = 0.055
 _FULL_SCALE_PX = 5.0
 """Residual at which the bar is full."""
 _INK, _QUIET, _PLATE = (236, 240, 242), (155, 171, 181), (17, 22, 26)
-_TONES = {"ok": (98, 205, 184), "weak": (240, 180, 92)}
-_BAD = (255, 154, 143)
+_TONES = {"ok": (98, 205, 184), "weak": (240, 180, 92), "bad": (255, 154, 143)}
 
 
 def write_overlay_videos(folder: Path, run: CalibrationRun) -> None:
@@ -49,18 +50,18 @@ def write_overlay_videos(folder: Path, run: CalibrationRun) -> None:
                 video.add(np.concatenate([overlay.image, _strip(overlay, run.result, strip)]))
 
 
-def write_thumbnail(path: Path, run: CalibrationRun) -> None:
-    """The used motion in the middle of the recording, or the middle one, as a JPEG of 160 x 120 px at most.
+def write_thumbnail(path: Path, drawn: Sequence[Overlay]) -> None:
+    """One of these pictures as a JPEG of 160 x 120 px at most: of the right camera and of a used motion where there is
+    one, from the middle.
 
     Raises:
         OutputError: it cannot be written.
     """
-    frames = run.poses.frames
-    if not len(frames):
+    right = [overlay for overlay in drawn if overlay.camera == "right"]
+    shown = [overlay for overlay in right if overlay.used] or right
+    if not shown:
         return
-    used = np.flatnonzero(run.result.motions.used[frames])
-    motion = used[len(used) // 2] if len(used) else len(frames) // 2
-    overlay = next(iter(overlays(run, np.array([motion]), "right")))
+    overlay = shown[len(shown) // 2]
     height, width = overlay.image.shape[:2]
     scale = min(THUMBNAIL_PX[0] / width, THUMBNAIL_PX[1] / height)
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
@@ -79,7 +80,7 @@ def _strip(overlay: Overlay, result: CalibrationResult, height: int) -> np.ndarr
     strip = np.full((height, width, 3), _PLATE, np.uint8)
     half, margin = height // 2, max(6, width // 80)
     value = result.residual(f"contour_{overlay.camera}", overlay.frame)
-    tone = _TONES.get(result.status, _BAD)
+    tone = _TONES[headline(result).tone]
     _write(strip, f"frame {overlay.frame}: {overlay.caption}", (margin, half), half, _INK if overlay.used else _QUIET)
     _write(strip, f"{result.status}: {result.message}", (margin, height), half, tone)
     if value is not None:
@@ -87,7 +88,7 @@ def _strip(overlay: Overlay, result: CalibrationResult, height: int) -> np.ndarr
         left, top, bottom = width - margin - length, round(0.3 * half), round(0.75 * half)
         cv2.rectangle(strip, (left, top), (width - margin, bottom), _QUIET, 1)
         full = round(length * min(1.0, value / _FULL_SCALE_PX))
-        cv2.rectangle(strip, (left, top), (left + full, bottom), _TONES["ok"] if overlay.used else _BAD, -1)
+        cv2.rectangle(strip, (left, top), (left + full, bottom), _TONES["ok" if overlay.used else "bad"], -1)
     return strip
 
 

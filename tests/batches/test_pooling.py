@@ -5,13 +5,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 from scipy.stats import chi2
 
+import data_synth
 import rmis_calib as rc
+from rmis_calib.batches import JobRecord
 from rmis_calib.batches.pooling import changes, drift, pool
+from rmis_calib.batches.run import setups_of
 from rmis_calib.batches.setups import compare
+from rmis_calib.batches.task import setup_of
 from rmis_calib.errors import InputError
+from rmis_calib.io import read_description
 from rmis_calib.results import Information
+
+_EYE = {"fx_px": 175.0, "fy_px": 175.0, "cx_px": 80.0, "cy_px": 60.0}
+TINY = {"motions": 1, "camera": {"width_px": 160, "height_px": 120, "right": _EYE, "left": None}}
 
 
 def tangent(result: rc.RigidTransform, other: np.ndarray) -> np.ndarray:
@@ -65,6 +74,23 @@ def test_what_a_covariance_allows_beyond_its_noise_is_kept(series) -> None:
     extra = np.diag([1e-4] * 3 + [4.0] * 3)
     doubtful = [replace(result, covariance=result.covariance + extra) for result in results]
     np.testing.assert_allclose(pool(doubtful).covariance, pool(results).covariance + extra, rtol=1e-3, atol=1e-6)
+
+
+def test_another_diameter_is_another_set_up(series, tmp_path) -> None:
+    """The radius's deviation from what was told is one unknown of all recordings that are pooled."""
+    results, _ = series
+    folder = data_synth.write_recording(tmp_path / "recording", data_synth.load_synth_config(TINY))
+    records = []
+    for name, diameter_mm in (("a", 8.0), ("b", 8.5), ("c", 8.0)):
+        told = yaml.safe_load((folder / "recording.yaml").read_text())
+        (folder / "recording.yaml").write_text(yaml.safe_dump(told | {"shaft_diameter_mm": diameter_mm}))
+        row = {"setup": setup_of(read_description(folder)), "status": "ok"}
+        (tmp_path / "out" / name).mkdir(parents=True)
+        results[len(records)].write(tmp_path / "out" / name / "result.json")
+        records.append(JobRecord(name, "", "calibrate", "", "finished", None, "", row))
+    pooled = {setup.names: setup.setup for setup in setups_of(tmp_path / "out", records)}
+    assert set(pooled) == {("a", "c"), ("b",)}
+    assert "8 mm shaft" in pooled["a", "c"] and "8.5 mm shaft" in pooled["b",]
 
 
 def test_results_of_one_set_up_agree_and_pool_to_the_truth(series) -> None:

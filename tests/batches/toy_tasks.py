@@ -24,6 +24,25 @@ def die_if_told(task, report):
     return kind
 
 
+def run_job_with_a_decoder_that_aborts(order, report):
+    """A job of a batch, in a process that the decoder takes down at the second picture of any video below `crash`."""
+    import resource
+
+    from rmis_calib.batches.task import run_job
+    from rmis_calib.io._video_file import VideoReader
+
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    pixels = VideoReader._pixels
+
+    def abort_at_the_second(self, frame, number):
+        if "crash" in self.path.parts and number == 1:
+            os.abort()
+        return pixels(self, frame, number)
+
+    VideoReader._pixels = abort_at_the_second
+    return run_job(order, report)
+
+
 def sleep(task, report):
     report("sleeping", 0, 1)
     time.sleep(task)

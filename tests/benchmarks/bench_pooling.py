@@ -26,7 +26,16 @@ from rmis_calib.geometry.rotations import matrix_to_rotvec
 from rmis_calib.solver import Problem
 from rmis_calib.solver.start.line_statistics import LineStatistics
 
-SETTINGS = {"solver": {"noise": {"estimate": "never"}, "unknowns": {"edge_bias": False}}}
+CASES = (
+    ("no bias correction", False, False),
+    ("bias correction, one seed", True, False),
+    ("bias correction, a seed a part", True, True),
+)
+
+
+def settings(bias: bool, seed: int) -> rc.CalibrationConfig:
+    solver = {"noise": {"estimate": "never"}, "unknowns": {"edge_bias": False}, "groups": 0, "advice": {"motions": 0}}
+    return parse_config({"solver": solver | {"bias_correction": bias, "seed": seed}})
 
 
 def observations(motions: int) -> rc.ShaftObservations:
@@ -63,23 +72,25 @@ def main() -> None:
         print(
             f"global, {name}: sum of parts and whole differ by {float((a - b).abs().max() / a.abs().max()):.1e} of it"
         )
-    config = parse_config(SETTINGS)
-    start = time.perf_counter()
-    big = rc.solve(seen, config, throw=False)
-    took_big = time.perf_counter() - start
-    start = time.perf_counter()
-    pooled = rc.pool([rc.solve(each, config, throw=False) for each in parts])
-    took_parts = time.perf_counter() - start
-    R, t = big.camera_right_T_arm.R, big.camera_right_T_arm.t
-    turn = matrix_to_rotvec(pooled.camera_right_T_arm.R @ R.mT)
-    gap = torch.cat([turn, pooled.camera_right_T_arm.t - t]).numpy()
-    sigma = np.sqrt(np.diag(big.covariance))
-    ratio = np.sqrt(np.diag(pooled.covariance)) / sigma
-    print(
-        f"joint, {arguments.motions} motions in {arguments.parts} parts: off by {np.abs(gap / sigma).max():.4f} "
-        f"sigma at most; sigma of the pooled one {ratio.min():.3f} to {ratio.max():.3f} of the whole's"
-    )
-    print(f"joint: the whole {took_big:.1f} s, the parts one after the other {took_parts:.1f} s")
+    for words, bias, own_seeds in CASES:
+        start = time.perf_counter()
+        big = rc.solve(seen, settings(bias, 0), throw=False)
+        took_big = time.perf_counter() - start
+        start = time.perf_counter()
+        pooled = rc.pool(
+            [rc.solve(each, settings(bias, seed * own_seeds), throw=False) for seed, each in enumerate(parts)]
+        )
+        took_parts = time.perf_counter() - start
+        R, t = big.camera_right_T_arm.R, big.camera_right_T_arm.t
+        turn = matrix_to_rotvec(pooled.camera_right_T_arm.R @ R.mT)
+        gap = torch.cat([turn, pooled.camera_right_T_arm.t - t]).numpy()
+        sigma = np.sqrt(np.diag(big.covariance))
+        ratio = np.sqrt(np.diag(pooled.covariance)) / sigma
+        print(
+            f"joint, {words}: off by {np.abs(gap / sigma).max():.4f} sigma at most; sigma of the pooled one "
+            f"{ratio.min():.3f} to {ratio.max():.3f} of the whole's; {took_big:.1f} s, parts {took_parts:.1f} s",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -17,11 +17,12 @@ import pyarrow.parquet
 import pytest
 
 import rmis_calib as rc
-from rmis_calib.batches import JobRecord, plan
+from rmis_calib.batches import JobRecord, plan, run
 from rmis_calib.batches.summary import TIMES
 from rmis_calib.cli import main
 from rmis_calib.errors import InputError, OutputError
 from rmis_calib.parallel.lock import holder_file, locked
+from tests.batches import toy_tasks
 
 ONE = rc.BatchSettings(workers=1, overlays=1)
 
@@ -141,6 +142,26 @@ def test_nobodys_files_are_lost(tree, tmp_path) -> None:
     with pytest.raises(InputError, match="none in it or below it"):
         rc.batch(tree / "empty", tmp_path / "nothing", settings=ONE)
     assert not (tmp_path / "nothing").exists()
+
+
+@pytest.mark.slow
+def test_a_video_that_takes_the_decoder_down_fails_alone(rendered_pairs, tmp_path, monkeypatch) -> None:
+    for name in ("crash", "well"):
+        shutil.copytree(rendered_pairs, tmp_path / "root" / name)
+    out = tmp_path / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "run_job", toy_tasks.run_job_with_a_decoder_that_aborts)
+        settings = rc.BatchSettings(workers=1, overlays=0, retries=1)
+        crash, well = rc.batch(tmp_path / "root", out, task="detect", settings=settings).records
+    assert (crash.outcome, crash.failure, well.outcome) == ("failed", "crash", "finished")
+    assert crash.message == "its process crashed (a decoder, most likely), signal SIGABRT in each of 2 attempts"
+    assert {path.name for path in (out / "crash").iterdir() if not path.name.startswith(".")} == {
+        "job.json",
+        "log.jsonl",
+    }
+    assert not list(out.rglob("*.tmp*"))
+    orders = plan(tmp_path / "root", out, rc.CalibrationConfig(), "detect", settings).orders
+    assert [order.job.name for order, _ in orders] == ["crash"]  # a machine's fault: worth another try
 
 
 def test_one_batch_at_a_time_and_the_dead_do_not_count(tmp_path) -> None:
