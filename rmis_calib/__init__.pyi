@@ -47,5 +47,7 @@ from .studies import study_noise as study_noise
 from .studies import study_plan as study_plan
 from .viewer import open_viewer as open_viewer
 from .vision import ShaftDetector as ShaftDetector
+from .vision.fine.subpixel import edge_points as edge_points
+from .vision.fine.subpixel import step_place as step_place
 
 __version__: str

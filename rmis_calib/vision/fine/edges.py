@@ -13,13 +13,12 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from rmis_calib.vision.coarse.strips import Strips
+from rmis_calib.vision.fine.subpixel import step_columns, step_estimator
 from rmis_calib.vision.image.run_length import masked_median
 from rmis_calib.vision.image.sampling import FullPicture
 
 # Blurs tried, in steps of the profile: from sharper than a pixel to soft motion blur.
 _BLURS = (0.5, 0.7, 0.95, 1.3, 1.8, 2.5, 3.4)
-# Ridge on the two slopes: enough to keep the system regular where a contour is flat, too little to bias its place.
-_SLOPE_RIDGE = 0.02
 # The separating colour is averaged over a sixth of the contour before and behind. Over a sixteenth the contours of the
 # preset carbon are 5 % better, but two more real shafts, out of focus and with little contrast, are lost.
 _NEIGHBOURS = 6
@@ -152,25 +151,6 @@ def fine(
     return EdgePoints(t, place, valid, height, blur * step_px)
 
 
-def _step_columns(offsets: Float[Tensor, " d"], blur: Float[Tensor, "*b"]) -> Float[Tensor, "*b d 5"]:
-    """Columns: level, step, derivative of the step by its place (negated), slope inside, slope outside."""
-    z = offsets / blur[..., None]
-    step = torch.special.ndtr(z)
-    bell = torch.exp(-0.5 * z * z) / (2.5066283 * blur[..., None])
-    ramp = offsets * step + blur[..., None] ** 2 * bell  # integral of the step: the outer side's blurred slope
-    return torch.stack([torch.ones_like(step), step, bell, ramp - offsets, ramp], -1)
-
-
-def step_estimator(offsets: Float[Tensor, " d"], blur: Float[Tensor, "*b"]) -> Float[Tensor, "*b 5 d"]:
-    """Least-squares solution as a matrix, with a weak prior that slopes are small and a window around the step."""
-    columns = _step_columns(offsets, blur)
-    reach = (2.5 * blur + 1.0)[..., None]
-    window = torch.exp(-0.5 * (offsets / reach) ** 4)[..., None]
-    weighted = (columns * window).mT
-    prior = torch.diag(offsets.new_tensor([0.0, 0.0, 0.0, 1.0, 1.0])) * _SLOPE_RIDGE
-    return torch.linalg.solve(weighted @ columns + prior, weighted)
-
-
 def _mean_blur(
     profile: Float[Tensor, "b k 2 p d"], use: Bool[Tensor, "b k 2 p"], offsets: Float[Tensor, " d"]
 ) -> Float[Tensor, "b k 2"]:
@@ -178,7 +158,7 @@ def _mean_blur(
     weight = use[..., None].to(profile.dtype)
     mean = (profile * weight).sum(-2) / weight.sum(-2).clamp(min=1.0)
     bank = offsets.new_tensor(_BLURS)
-    columns = _step_columns(offsets, bank)  # (n, d, 5)
+    columns = step_columns(offsets, bank)  # (n, d, 5)
     fit = torch.linalg.pinv(columns)
     residual = mean[..., None, :] - torch.einsum("ndc,nce,bkse->bksnd", columns, fit, mean)
     misfit = (residual**2).sum(-1)

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rmis_calib.vision.coarse.strips import Strips
-from rmis_calib.vision.fine.edges import step_estimator
+from rmis_calib.vision.fine.subpixel import step_estimator
 from rmis_calib.vision.image.sampling import FullPicture
 
 _ROWS = 11
