@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -53,7 +54,7 @@ def open_bag(path: Path, salvage: bool, note: Note) -> Iterator[Bag]:
     store = get_typestore(Stores.ROS2_JAZZY)
     reader = None
     try:
-        reader = AnyReader([path], default_typestore=store)
+        reader = AnyReader(_files(path), default_typestore=store)
         reader.open()
     except _damage() as problem:
         if not salvage:
@@ -67,6 +68,13 @@ def open_bag(path: Path, salvage: bool, note: Note) -> Iterator[Bag]:
         yield _whole(reader, path, salvage, note)
     finally:
         reader.close()
+
+
+def _files(path: Path) -> list[Path]:
+    """What rosbags opens: a file, a ROS2 folder, or the files of a folder that a recorder split or left unfinished."""
+    if not path.is_dir() or (path / "metadata.yaml").is_file():
+        return [path]
+    return sorted(file for file in path.iterdir() if file.suffix in (".bag", ".mcap", ".db3")) or [path]
 
 
 def _whole(reader: Any, path: Path, salvage: bool, note: Note) -> Bag:
@@ -246,10 +254,11 @@ def _check_clocks(frame_ns: np.ndarray, arms: dict[str, ArmLog], note: Note) -> 
 
 
 class _Pairs:
-    """Pictures written as they come; of two eyes only those that belong together."""
+    """Pictures written as they come; of two eyes only those that belong together, both encoded at once."""
 
     def __init__(self, job: Job, right: Topic, left: Topic | None) -> None:
         self._job, self._right, self._left = job, right, left
+        self._pool = ThreadPoolExecutor(max_workers=2, thread_name_prefix="rmis-encode")
         self._waiting: dict[str, deque[tuple[int, Any]]] = {
             right.name: deque(),
             **({left.name: deque()} if left else {}),
@@ -287,6 +296,7 @@ class _Pairs:
         if self._left is not None:
             self._match(at_end=True)
             self._lost += sum(map(len, self._waiting.values()))
+        self._pool.shutdown()
         where = self._right.name
         if not self._ns:
             expected = "pictures of both eyes with stamps that belong together" if self._left else "pictures"
@@ -321,8 +331,11 @@ class _Pairs:
 
     def _write(self, ns: int, right: Any, left: Any) -> None:
         number = f"{len(self._ns):06d}"
-        for side, message, topic in (("right", right, self._right), ("left", left, self._left)):
-            if message is not None and topic is not None:
-                _, size = write_picture(message, self._job.folder / side / number, topic.name)
-                self.size = self.size or size
+        eyes = [("right", right, self._right), *([("left", left, self._left)] if self._left is not None else [])]
+        written = [
+            self._pool.submit(write_picture, message, self._job.folder / side / number, topic.name)
+            for side, message, topic in eyes
+        ]
+        for future in written:
+            self.size = self.size or future.result()[1]
         self._ns.append(ns)

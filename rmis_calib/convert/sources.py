@@ -60,7 +60,7 @@ def _read_folder(job: Job, settings: ConvertSettings) -> tuple[Material, Convert
         from rmis_calib.convert.session import convert_session
 
         return convert_session(job, settings), settings
-    if "metadata.yaml" in names or any(Path(name).suffix in (".mcap", ".db3") for name in names):
+    if "metadata.yaml" in names or any(Path(name).suffix in BAGS for name in names):
         from rmis_calib.convert.bags import convert_bag
 
         return convert_bag(job, settings), settings

@@ -15,6 +15,7 @@ from .configs import config_path as config_path
 from .configs import load_yaml as load_yaml
 from .description import RecordingDescription as RecordingDescription
 from .description import read_description as read_description
+from .dvrk_robot import import_dvrk as import_dvrk
 from .joints import JointLog as JointLog
 from .observations import ShaftObservations as ShaftObservations
 from .recording import Recording as Recording
@@ -24,6 +25,7 @@ from .robot import HeadPoint as HeadPoint
 from .robot import Joint as Joint
 from .robot import Robot as Robot
 from .robot import load_robot as load_robot
+from .robot import robot_to_dict as robot_to_dict
 from .stereo import read_camera_pair as read_camera_pair
 from .stereo import read_stereo as read_stereo
 from .tables import HeadPoints as HeadPoints

@@ -71,6 +71,8 @@ class Intrinsics:
             RecordingError: a number that no camera has; names the key.
         """
         height, width = self.image_size
+        if min(height, width) < 1:
+            raise RecordingError(where=where, expected="an image size of 1 px or more", found=self.image_size)
         least, most = (width * factor for factor in _FOCAL_WIDTHS)
         for key, value in (("fx", self.fx), ("fy", self.fy)):
             if not least <= value <= most:
@@ -131,6 +133,8 @@ def lens(distortion: Sequence[float], name: str | None, where: str, note: Note) 
         RecordingError: a model or a number of entries that is not known, or terms that are not modelled.
     """
     values = tuple(float(value) for value in distortion)
+    if not np.isfinite(values).all():
+        raise RecordingError(where=where, expected="finite distortion coefficients", found=list(values))
     if name is not None and name not in _SAME_LENS:
         expected = f"a lens model of {', '.join(sorted(_SAME_LENS))}"
         raise RecordingError(where=where, expected=expected, found=name)
@@ -186,6 +190,8 @@ def stereo_pair(
         note(f"{where}: the translation was read in {unit}: a baseline of {length * mm_per_unit:.4g} mm")
     rows = np.eye(4)
     rows[:3, :3], rows[:3, 3] = second_R_first, t * mm_per_unit
+    if not np.isfinite(rows).all():
+        raise RecordingError(where=where, expected="finite numbers in rotation and translation", found="others")
     second_T_first = rigid_from_text(rows.tolist(), where, RecordingError, note)
     check_baseline(length * mm_per_unit, where)
     first_p_second = -second_T_first[:3, :3].T @ second_T_first[:3, 3]

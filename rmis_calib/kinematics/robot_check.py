@@ -73,11 +73,8 @@ def _check_arm(robot: Robot, name: str, arm: Arm) -> ArmReport:
     if arm.base_T_arm_base is not None:
         frames = np.asarray(arm.base_T_arm_base) @ frames
     joints = tuple(_described(joint) for joint in arm.joints)
-    remarks = tuple(
-        f"{joint.name} has no limits: readings are checked only for the right unit"
-        for joint in arm.joints
-        if joint.min is None
-    )
+    free = ", ".join(joint.name for joint in arm.joints if joint.min is None)
+    remarks = (f"no limits of {free}: their readings are checked only for the right unit",) if free else ()
     if not arm.is_instrument or arm.rcm_frame is None or arm.shaft_frame is None or arm.head_point is None:
         tool = (frames[:, -1] @ np.asarray(arm.end_T_tool))[:, :3, 3]
         reach = np.stack([tool.min(0), tool.max(0)])

@@ -58,11 +58,42 @@ def check_same(expected: Path, found: Path) -> None:
     ]
 
 
-def test_a_bare_mcap_and_a_folder_without_metadata(rendered: Path, tmp_path: Path) -> None:
+def test_a_bare_mcap(rendered: Path, tmp_path: Path) -> None:
     bag = write_bag(rendered, tmp_path / "a", "mcap")
     (bare,) = bag.glob("*.mcap")
     convert(bare, tmp_path / "bare", settings(rendered))
     check_same(rendered, tmp_path / "bare")
+
+
+def test_a_folder_of_split_bags(rendered: Path, tmp_path: Path) -> None:
+    """A recorder that starts a new file every so often, and one that was killed before it wrote metadata.yaml."""
+    times, columns, rows, _ = read_recording(rendered)
+    middle = 0.5 * (times[2] + times[3])
+    folder = tmp_path / "split"
+    folder.mkdir()
+    for number, (first, last) in enumerate(((-1.0, middle), (middle, 1e9))):
+        part = tmp_path / f"part{number}"
+        shutil.copytree(rendered, part)
+        inside = (rows[:, 0] >= first) & (rows[:, 0] < last)
+        shown = np.flatnonzero((times >= first) & (times < last))
+        write_rows(part / "joints.csv", columns, rows[inside])
+        write_rows(
+            part / "frame_times.csv", ["frame", "timestamp_s"], np.stack([np.arange(len(shown)), times[shown]], 1)
+        )
+        for side in ("right", "left"):
+            for new, old in enumerate(shown):
+                shutil.copy(rendered / side / f"{old:06d}.png", part / side / f"{new:06d}.png")
+        write_bag(part, folder / f"a_{number}.bag", "ros1")
+    convert(folder, tmp_path / "out", settings(rendered))
+    check_same(rendered, tmp_path / "out")
+    bag = write_bag(rendered, tmp_path / "b", "sqlite3")
+    (bag / "metadata.yaml").unlink()
+    convert(bag, tmp_path / "killed", settings(rendered))
+    check_same(rendered, tmp_path / "killed")
+
+
+def write_rows(path: Path, columns: list[str], rows: np.ndarray) -> None:
+    path.write_text("\n".join([",".join(columns), *(",".join(map(repr, row)) for row in rows.tolist())]) + "\n")
 
 
 def test_overrides_and_a_still_camera(rendered: Path, tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Calibrations of other programs, each written by the test or its own library, against one rig with known numbers."""
 
+import contextlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +14,7 @@ from recording_files import RecordingFolder
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
-from rmis_calib.errors import RecordingError
+from rmis_calib.errors import RecordingError, RmisCalibError
 from rmis_calib.io.intrinsics import StereoFile
 from rmis_calib.io.recording import load_recording
 from rmis_calib.io.stereo import read_stereo
@@ -344,3 +345,37 @@ def test_what_we_write_is_what_we_read(tmp_path: Path) -> None:
     found = read_stereo(surgpose_ini(tmp_path))
     (tmp_path / "stereo.yaml").write_text(yaml.safe_dump(found.to_dict()))
     check(read_stereo(tmp_path / "stereo.yaml"), tolerance=1e-12)
+
+
+@pytest.mark.parametrize("name", [*WRITERS, "kalibr"])
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.35, 0.6, 0.8, 0.95])
+def test_a_file_that_is_cut_off_is_one_clear_line(tmp_path: Path, name: str, share: float) -> None:
+    whole = kalibr_file(tmp_path) if name == "kalibr" else WRITERS[name](tmp_path)
+    for path in sorted(whole.iterdir()) if whole.is_dir() else [whole]:
+        content = path.read_bytes()
+        path.write_bytes(content[: int(share * len(content))])
+        try:
+            found = read_stereo(whole, picture_size=lambda: SIZE)
+        except RmisCalibError as error:
+            assert str(tmp_path) in str(error) and "\n" not in str(error)
+        else:
+            # Only something without a meaning can be missing: an end tag, the last digits of a number.
+            assert found.left is None or found.camera_left_T_camera_right is not None
+        path.write_bytes(content)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_damaged_files_never_end_in_a_traceback(tmp_path: Path, seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    # Not .mat: what MATLAB writes is compressed and has checksums; SciPy's own writer leaves them out, and its reader
+    # then runs off the end of a damaged file.
+    names = [name for name in WRITERS if name != "MATLAB .mat"]
+    name = names[seed % len(names)]
+    whole = WRITERS[name](tmp_path)
+    for path in sorted(whole.iterdir()) if whole.is_dir() else [whole]:
+        content = bytearray(path.read_bytes())
+        for place in generator.integers(0, len(content), 4):
+            content[place] = generator.integers(32, 127)
+        path.write_bytes(bytes(content))
+        with contextlib.suppress(RmisCalibError):
+            read_stereo(whole, picture_size=lambda: SIZE)

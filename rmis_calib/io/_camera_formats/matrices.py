@@ -48,9 +48,10 @@ def read_opencv(paths: tuple[Path, ...], note: Note, picture_size: PictureSize) 
             names = storage.root().keys()
             entries |= {name: _node_value(storage.getNode(name)) for name in names}
             storage.release()
-        except cv2.error as problem:
-            found = f"damage ({problem.err})"
-            raise RecordingError(where=str(path), expected="an OpenCV FileStorage file", found=found) from problem
+        except (cv2.error, SystemError) as problem:  # its constructor fails as a SystemError
+            raise RecordingError(
+                where=str(path), expected="a whole OpenCV FileStorage file", found="damage"
+            ) from problem
     return from_matrices(entries, str(paths[0]), note, picture_size)
 
 

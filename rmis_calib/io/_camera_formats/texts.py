@@ -33,7 +33,9 @@ def read_ini(path: Path, note: Note) -> StereoFile:
         if isinstance(problem, RecordingError):
             raise
         expected = "res_x, res_y, fc_x, fc_y, cc_x, cc_y, kc_0, ... for both eyes, R_0 to R_8 and T_0 to T_2"
-        raise RecordingError(where=str(path), expected=expected, found=f"trouble at {problem}") from problem
+        raise RecordingError(
+            where=str(path), expected=expected, found=f"trouble at {' '.join(str(problem).split())}"
+        ) from problem
     return stereo_pair(cameras[0], cameras[1], R, t, f"{path}: T", note, 1.0, are_named=True)
 
 
@@ -105,19 +107,25 @@ def from_camchain(raw: dict[str, Any], path: Path, note: Note) -> StereoFile:
         raise RecordingError(where=str(path), expected="one or two cameras", found=", ".join(names))
     cameras = []
     for name in names:
-        where, camera = f"{path}: {name}", raw[name]
+        where, camera = f"{path}: {name}", raw[name] if isinstance(raw[name], dict) else {}
         if camera.get("camera_model") != "pinhole":
             expected = "camera_model pinhole (kalibr_calibrate_cameras --models pinhole-radtan or pinhole-equi)"
             raise RecordingError(where=where, expected=expected, found=camera.get("camera_model"))
-        model, distortion = lens(camera.get("distortion_coeffs") or (), camera.get("distortion_model"), where, note)
         try:
-            (fx, fy, cx, cy), (width, height) = camera["intrinsics"], camera["resolution"]
+            fx, fy, cx, cy = map(float, camera["intrinsics"])
+            width, height = map(int, camera["resolution"])
+            bent = [float(value) for value in camera.get("distortion_coeffs") or ()]
         except (KeyError, TypeError, ValueError) as problem:
-            raise RecordingError(where=where, expected="4 intrinsics and a resolution", found="others") from problem
-        cameras.append(Intrinsics(fx, fy, cx, cy, distortion, (int(height), int(width)), model).checked(where))
+            expected = "numbers: 4 intrinsics, a resolution of 2, distortion_coeffs"
+            raise RecordingError(where=where, expected=expected, found="others") from problem
+        model, distortion = lens(bent, camera.get("distortion_model"), where, note)
+        cameras.append(Intrinsics(fx, fy, cx, cy, distortion, (height, width), model).checked(where))
     if len(cameras) == 1:
         return StereoFile(cameras[0], None, None)
-    rows = np.asarray(raw[names[1]].get("T_cn_cnm1", ()), dtype=np.float64)
+    try:
+        rows = np.asarray(raw[names[1]].get("T_cn_cnm1", ()), dtype=np.float64)
+    except (TypeError, ValueError):
+        rows = np.empty(0)
     if rows.shape != (4, 4):
         raise RecordingError(where=f"{path}: {names[1]}.T_cn_cnm1", expected="4 rows of 4", found=rows.shape)
     return stereo_pair(cameras[0], cameras[1], rows[:3, :3], rows[:3, 3], f"{path}: {names[1]}.T_cn_cnm1", note, 1000.0)
@@ -155,8 +163,9 @@ def _only(folder: Path, pattern: str) -> Path:
 
 
 def _matrix(path: Path, shape: tuple[int, int] | None) -> np.ndarray:
+    text = _text(path)
     try:
-        matrix = np.loadtxt(_text(path).splitlines(), ndmin=2)
+        matrix = np.loadtxt(text.splitlines(), ndmin=2) if text.strip() else np.empty((0, 0))
     except ValueError as problem:
         raise RecordingError(where=str(path), expected="rows of numbers", found="other text") from problem
     if shape is not None and matrix.shape != shape:
