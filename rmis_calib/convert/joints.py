@@ -1,5 +1,6 @@
 """Logs of arms as readings of a robot: names and units matched, poses turned into joints, the robot told by poses."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,7 +42,7 @@ def readings_of(log: ArmLog, name: str, arm: Arm, note: Note) -> Readings:
     if not log.has_joints:
         return _readings_of_poses(log, name, arm, note)
     ns, values = np.array(log.joint_ns, dtype=np.int64), np.array(log.joints, dtype=np.float64)
-    order = _order(log, name, arm, note)
+    order = joint_order(log.joint_names, values.shape[1], arm, f"{log.name} as arm {name}", note)
     scale = np.array([1.0 if joint.type == "revolute" else _MM for joint in arm.joints])
     note(f"{log.name}: {len(ns)} readings of {', '.join(joint.name for joint in arm.joints)}; metres became mm")
     return _increasing(ns, values[:, order] * scale, log.name, note)
@@ -71,17 +72,28 @@ def choose_robot(logs: list[ArmLog], note: Note) -> str:
     return name
 
 
-def _order(log: ArmLog, name: str, arm: Arm, note: Note) -> list[int]:
-    """Columns of the log in the order of the arm's joints: by name where all are known, else by place."""
+def joint_order(joint_names: Sequence[str], count: int, arm: Arm, where: str, note: Note) -> list[int]:
+    """Places of the arm's joints among those of a message or log: by name where all are known, else by place.
+
+    Args:
+        joint_names: as the robot calls them, with or without `outer_`; may be empty.
+        count: number of joints that there are.
+        arm: the table.
+        where: what it is, for messages.
+        note: told what was guessed.
+
+    Raises:
+        RecordingError: another number of joints, and not all of the arm's by name.
+    """
     known = [joint.name for joint in arm.joints]
-    said = [word.removeprefix("outer_") for word in log.joint_names]
+    said = [word.removeprefix("outer_") for word in joint_names]
     if set(known) <= set(said):
         return [said.index(joint) for joint in known]
-    if len(log.joints[0]) != len(known):
+    if count != len(known):
         expected = f"{len(known)} joints ({', '.join(known)})"
-        found = f"{len(log.joints[0])} ({', '.join(said) or 'without names'}): another robot? give --robot"
-        raise RecordingError(where=f"{log.name} as arm {name}", expected=expected, found=found)
-    note(f"{log.name}: its joints ({', '.join(said) or 'without names'}) were taken in the robot's order")
+        found = f"{count} ({', '.join(said) or 'without names'}): another robot? give --robot"
+        raise RecordingError(where=where, expected=expected, found=found)
+    note(f"{where}: its joints ({', '.join(said) or 'without names'}) were taken in the robot's order")
     return list(range(len(known)))
 
 
