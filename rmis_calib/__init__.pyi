@@ -42,9 +42,11 @@ from .results import CalibrationResult as CalibrationResult
 from .solver.model.pose_refinement import Refinement as Refinement
 from .solver.model.pose_refinement import refine as refine
 from .solver.own_measurement import Measurement as Measurement
+from .studies import study_comparison as study_comparison
 from .studies import study_motions as study_motions
 from .studies import study_noise as study_noise
 from .studies import study_plan as study_plan
+from .studies import study_reprojection as study_reprojection
 from .viewer import open_viewer as open_viewer
 from .vision import ShaftDetector as ShaftDetector
 from .vision.fine.subpixel import edge_points as edge_points

@@ -20,7 +20,13 @@ from rmis_calib.cli.console import LOG_INTERVAL_S, say, time_left
 from rmis_calib.cli.usage import parse_arguments
 from rmis_calib.errors import InputError
 from rmis_calib.io.configs import did_you_mean
-from rmis_calib.studies.settings import MotionsStudySettings, NoiseStudySettings, PlanSettings
+from rmis_calib.studies.settings import (
+    ComparisonStudySettings,
+    MotionsStudySettings,
+    NoiseStudySettings,
+    PlanSettings,
+    ReprojectionStudySettings,
+)
 
 if TYPE_CHECKING:
     from rmis_calib.studies.engine import Progress
@@ -93,9 +99,49 @@ class Plan(_Study):
             return conclude_study(study_plan(self.out, self.settings, progress=progress, command=self.command))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Reprojection(_Study):
+    """Head-point error in pixels against the number of motions, on rendered pictures (Fig. 5).
+
+    Writes OUT/index.html, reprojection.pdf, reprojection.png, trials.csv, trials.parquet and summary.csv. Started again
+    in the same folder, it goes on where it stopped.
+    """
+
+    out: Path = Path("study_reprojection")
+    """Folder to write, or to go on with."""
+    settings: tyro.conf.OmitArgPrefixes[ReprojectionStudySettings] = field(default_factory=ReprojectionStudySettings)
+
+    def run(self) -> int:
+        from rmis_calib.studies import study_reprojection
+
+        with study_reporter() as progress:
+            return conclude_study(study_reprojection(self.out, self.settings, progress=progress, command=self.command))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison(_Study):
+    """Calibration from the instrument against calibration with a board, through the same narrow motion (Fig. 6).
+
+    Writes OUT/index.html, comparison_motions and comparison_experiments (.pdf, .png), trials.csv, trials.parquet and
+    summary.csv. Started again in the same folder, it goes on where it stopped.
+    """
+
+    out: Path = Path("study_comparison")
+    """Folder to write, or to go on with."""
+    settings: tyro.conf.OmitArgPrefixes[ComparisonStudySettings] = field(default_factory=ComparisonStudySettings)
+
+    def run(self) -> int:
+        from rmis_calib.studies import study_comparison
+
+        with study_reporter() as progress:
+            return conclude_study(study_comparison(self.out, self.settings, progress=progress, command=self.command))
+
+
 STUDIES: dict[str, tuple[type, str]] = {
     "noise": (Noise, "error against noise, by method and number of cameras (Fig. 2)"),
     "motions": (Motions, "error against the number of motions, by which arm moves (Fig. 3)"),
+    "reprojection": (Reprojection, "head-point error in pixels, from rendered pictures (Fig. 5)"),
+    "comparison": (Comparison, "instrument against calibration board (Fig. 6)"),
     "plan": (Plan, "how many motions a wanted accuracy takes"),
 }
 
@@ -118,7 +164,7 @@ def parse_study(argv: Sequence[str]) -> Any:
         parsed = parse_arguments(STUDIES[name][0], argv[1:], f"rmis-calib study {name}")
         return replace(parsed, command=shlex.join(["rmis-calib", "study", *argv]))
     except InputError as error:
-        where = re.sub(r"^--(run|setup)\.", "--", error.where)  # the flags have no groups in their names
+        where = re.sub(r"^--(run|setup|pictures)\.", "--", error.where)  # the flags have no groups in their names
         raise InputError(where=where, expected=error.expected, found=error.found) from None
 
 

@@ -1,11 +1,16 @@
+from .comparison import study_comparison as study_comparison
 from .motions import study_motions as study_motions
 from .noise import study_noise as study_noise
 from .output import StudyResult as StudyResult
 from .plan import study_plan as study_plan
 from .registry import method as method
 from .registry import noise_source as noise_source
+from .reprojection import study_reprojection as study_reprojection
+from .settings import ComparisonStudySettings as ComparisonStudySettings
 from .settings import MotionsStudySettings as MotionsStudySettings
 from .settings import NoiseStudySettings as NoiseStudySettings
+from .settings import PictureSettings as PictureSettings
 from .settings import PlanSettings as PlanSettings
+from .settings import ReprojectionStudySettings as ReprojectionStudySettings
 from .settings import RunSettings as RunSettings
 from .settings import SetupSettings as SetupSettings

@@ -20,6 +20,8 @@ from rmis_calib.studies.registry import Method, NoiseSource, find_method, find_n
 from rmis_calib.studies.settings import Cameras, SetupSettings
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from rmis_calib.studies.measures import Bound
     from rmis_calib.studies.simulation import Condition, Trials
 
@@ -90,7 +92,7 @@ def make_cells(
 
     Noise is drawn from the same seeds in every condition, so that differences between conditions are not those of luck.
     """
-    common = [__version__, asdict(setup), _content_of(setup), [_digest(path) for path in extensions]]
+    common = [__version__, asdict(setup), _content_of(setup), [file_digest(path) for path in extensions]]
     cells = []
     for condition in conditions:
         block = min(_MOST_TRIALS, max(1, _BLOCK_MOTIONS // condition.motions))
@@ -198,8 +200,15 @@ def solve_trials(method: Method, trials: "Trials", cameras: int) -> Columns:
         "translation_error_mm": translation_mm(errors),
         "working_point_error_mm": point,
     }
-    columns: Columns = {name: torch.nan_to_num(value, nan=torch.inf).tolist() for name, value in measures.items()}
+    columns: Columns = {name: finite_or_infinite(value) for name, value in measures.items()}
     return columns | {"rotation_sigma_deg": sigma_deg, "translation_sigma_mm": sigma_mm, "status": status}
+
+
+def finite_or_infinite(errors: "Tensor") -> list[float]:
+    """Errors of trials (trials,); no answer is infinitely wrong."""
+    import torch
+
+    return torch.nan_to_num(errors, nan=torch.inf, posinf=torch.inf).tolist()
 
 
 def _count(cameras: Cameras) -> int:
@@ -215,10 +224,15 @@ def _label(condition: "Condition") -> str:
 def _content_of(setup: SetupSettings) -> list[str]:
     """Digests of the files that a set-up names: other content, other numbers."""
     named = [Path(item) for item in (setup.robot, setup.stereo) if item is not None]
-    return [_digest(path) for path in named if path.is_file()]
+    return [file_digest(path) for path in named if path.is_file()]
 
 
-def _digest(path: Path) -> str:
+def file_digest(path: Path) -> str:
+    """Of a file's content.
+
+    Raises:
+        InputError: it cannot be read.
+    """
     try:
         return hashlib.blake2b(path.read_bytes(), digest_size=8).hexdigest()
     except OSError as error:

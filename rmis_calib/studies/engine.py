@@ -11,7 +11,7 @@ from rmis_calib.errors import InputError, OutputError, RmisCalibError
 from rmis_calib.io.outputs import check_file, is_json_of, is_report
 from rmis_calib.parallel.lock import locked
 from rmis_calib.parallel.processes import Event, Limits, cores, free_memory_bytes, run_tasks
-from rmis_calib.studies.cells import Cell, run_cell
+from rmis_calib.studies.cells import run_cell
 from rmis_calib.studies.settings import RunSettings
 
 if TYPE_CHECKING:
@@ -74,11 +74,11 @@ def study_folder(out: Path, kind: str, names: Sequence[str]) -> Iterator[Path]:
         yield out / STORE
 
 
-def run_cells(cells: Sequence[Cell], run: RunSettings, progress: Watcher, work: Any = run_cell) -> "pyarrow.Table":
+def run_cells(cells: Sequence[Any], run: RunSettings, progress: Watcher, work: Any = run_cell) -> "pyarrow.Table":
     """Do what is not stored yet, and gather the rows of all cells.
 
     Args:
-        cells: of the study.
+        cells: of the study (`Cell`, `Experiment`): a dataclass with `parts` and a `weight`.
         run: workers or cluster.
         progress: called when a cell ends.
         work: does a cell; returns what went wrong.
@@ -109,7 +109,7 @@ def run_cells(cells: Sequence[Cell], run: RunSettings, progress: Watcher, work: 
     return _gathered(cells)
 
 
-def _events(todo: Sequence[Cell], run: RunSettings, work: Any) -> Any:
+def _events(todo: Sequence[Any], run: RunSettings, work: Any) -> Any:
     workers = min(run.workers or cores(), max(1, len(todo)))
     if not todo or (workers == 1 and run.cluster is None):
         return _in_this_process(todo, work)
@@ -127,12 +127,12 @@ def _events(todo: Sequence[Cell], run: RunSettings, work: Any) -> Any:
     return run_tasks(todo, work, workers, limits)
 
 
-def _in_this_process(todo: Sequence[Cell], work: Any) -> Iterator[Event]:
+def _in_this_process(todo: Sequence[Any], work: Any) -> Iterator[Event]:
     for index, cell in enumerate(todo):
         yield Event(index, "finished", work(cell, lambda *_: None), 1, 0)
 
 
-def _gathered(cells: Sequence[Cell]) -> "pyarrow.Table":
+def _gathered(cells: Sequence[Any]) -> "pyarrow.Table":
     """All rows, in the order of the cells."""
     import pyarrow
     import pyarrow.parquet

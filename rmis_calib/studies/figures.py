@@ -8,7 +8,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as MplFigure
-from matplotlib.ticker import FuncFormatter, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from rmis_calib.io.atomic import atomic_write
 from rmis_calib.studies.plots import BOUND_COLOUR, COLOURS, MARKERS, Figure, Panel, Series
@@ -16,6 +16,8 @@ from rmis_calib.studies.plots import BOUND_COLOUR, COLOURS, MARKERS, Figure, Pan
 _WIDTH_IN = 7.2
 """Both columns of a journal's page."""
 _PANEL_HEIGHT_IN = 1.9
+_FINE = 60.0
+"""Axes that span less get numbers between the decades."""
 _DASHES = ("-", (0, (5, 2)), (0, (1, 1.5)), (0, (5, 2, 1, 2)))
 _RC: Any = {
     "font.family": "DejaVu Sans",
@@ -69,6 +71,10 @@ def _draw(figure: Figure) -> MplFigure:
                 axes.set_xlabel(row[c].x_label)
             if c == 0:
                 axes.set_ylabel(row[c].y_label)
+    for axes in panels[:, 0]:
+        least, most = axes.get_ylim()
+        if most < _FINE * least:  # decades alone would leave an axis with a number or none
+            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     handles: dict[str, Any] = {}
     for axes in panels.flat:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
@@ -121,7 +127,7 @@ def _draw_method(axes: Axes, series: Series) -> None:
     axes.errorbar(
         x, middle, yerr=bars, color=colour, marker=MARKERS[place], markersize=3.2,
         linewidth=1.0 if series.style.has_line else 0.0, elinewidth=0.7, capsize=1.5, capthick=0.7,
-        label=series.name if series.style.has_line else None,  # hollow points are for the caption
+        label=series.name if series.style.is_named else None,
 
         markerfacecolor=colour if series.style.has_line else "white", markeredgewidth=0.7,
     )  # fmt: skip

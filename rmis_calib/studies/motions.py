@@ -1,7 +1,6 @@
 """Error against the number of motions: the paper's Fig. 3, for every split of the motions over the two arms."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from rmis_calib.studies.engine import Watcher
@@ -124,5 +123,5 @@ def _others(groups: Sequence[Group], measure: str, ready: Ready) -> list[Series]
         own = [group for group in groups if group.keys["method"] == method.name]
         if own:
             name = f"{method.title}, other splits"
-            series.append(curve(own, measure, "motions", name, replace(Style(index), has_line=False)))
+            series.append(curve(own, measure, "motions", name, Style(index, has_line=False, is_named=False)))
     return series

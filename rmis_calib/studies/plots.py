@@ -16,11 +16,13 @@ BOUND_COLOUR = "#000000"
 
 @dataclass(frozen=True)
 class Style:
-    """How a series looks: the place of its colour and marker in the palettes; of a bound, of its dashes."""
+    """How a series looks: the place of its colour and marker in the palettes; of a bound, of its dashes. Points without
+    a line are hollow, and explained by the caption unless they are named."""
 
     index: int
     is_bound: bool = False
     has_line: bool = True
+    is_named: bool = True
 
 
 @dataclass(frozen=True)

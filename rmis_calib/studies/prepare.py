@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from rmis_calib.errors import InputError
@@ -36,14 +37,23 @@ def prepare(settings: Any, sources: Sequence[str] | None = None) -> Ready:
     Raises:
         FileError, InputError: an extension, robot or stereo file that does not work, or a name that is not known.
     """
-    load_extensions(settings.run.extensions)
+    methods = find_methods(settings.methods, settings.run.extensions)
     names = settings.sources if sources is None else sources
-    methods = tuple(find_method(name) for name in dict.fromkeys(settings.methods))
     found = tuple(find_noise_source(name) for name in dict.fromkeys(names))
-    if not methods:
-        raise InputError(where="--methods", expected="at least one method", found="none")
     setup = make_setup(settings.setup)
     cameras: list[Cameras] = [view for view in dict.fromkeys(settings.cameras) if setup.cameras == 2 or view == "mono"]
     if not cameras:
         raise InputError(where="--cameras", expected="mono: the stereo file has one camera", found="stereo")
     return Ready(methods, found, tuple(cameras), setup)
+
+
+def find_methods(names: Sequence[str], extensions: Sequence[Path]) -> tuple[Method, ...]:
+    """Methods by name, with those of the extensions.
+
+    Raises:
+        FileError, InputError: an extension that does not work, no name, or one that is not known.
+    """
+    load_extensions(extensions)
+    if not names:
+        raise InputError(where="--methods", expected="at least one method", found="none")
+    return tuple(find_method(name) for name in dict.fromkeys(names))

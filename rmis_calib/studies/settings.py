@@ -151,3 +151,67 @@ class PlanSettings:
     def n_trials(self) -> int:
         """A share of recordings takes more trials than a median."""
         return self.run.trials or (40 if self.run.quick else 200)
+
+
+@dataclass(frozen=True, config=_STRICT)
+class PictureSettings:
+    """What is rendered, and how noisy the robot is."""
+
+    preset: str = "demo"
+    """Appearance: a preset of configs/synth or a YAML file."""
+    rotation_range_deg: Positive = 10.0
+    """Full range of every revolute joint."""
+    translation_range_mm: Positive = 20.0
+    """Full range of every insertion."""
+    kinematics_noise_mm: NotNegative = 0.3
+    """Noise of each arm's end pose, 1 sigma per axis, drawn anew for every motion and trial."""
+    kinematics_noise_deg: NotNegative = 0.1
+    """Rotational part of the same."""
+    validation: Count = 15
+    """Further poses of the instrument, whose head point is compared with where the calibration puts it."""
+
+
+@dataclass(frozen=True, config=_STRICT)
+class ReprojectionStudySettings:
+    """Head-point reprojection error against the number of motions, through the whole vision pipeline (Fig. 5)."""
+
+    methods: tuple[str, ...] = ("paper", "global", "joint-axis", "joint")
+    """Methods to compare."""
+    motions: tuple[Annotated[int, Field(ge=4)], ...] | None = None
+    """Numbers of motions; as many are rendered as the largest. Default: 8 to 343; with --quick 8, 16 and 32."""
+    cameras: tuple[Cameras, ...] = ("mono", "stereo")
+    """Cameras used."""
+    pictures: PictureSettings = PictureSettings()
+    """What is rendered."""
+    run: RunSettings = RunSettings()
+    """How it is run."""
+
+    @property
+    def n_trials(self) -> int:
+        """The paper's 20."""
+        return self.run.trials or (8 if self.run.quick else 20)
+
+
+@dataclass(frozen=True, config=_STRICT)
+class ComparisonStudySettings:
+    """Calibration from the instrument against calibration with a board (Fig. 6)."""
+
+    methods: tuple[str, ...] = ("paper", "joint-axis", "joint")
+    """Methods on lines."""
+    board_methods: tuple[str, ...] = ("ata", "park", "refine")
+    """Methods on the board, of `rc.baselines`; `ata` uses both cameras, as the paper's comparison does."""
+    experiments: Count | None = None
+    """Set-ups with another hand-eye transform each. Default: 6, and 1 with --quick."""
+    motions: tuple[Annotated[int, Field(ge=4)], ...] | None = None
+    """Numbers of motions of the instrument. Default: 12, 24, 48, 96, 192, 343; with --quick 12 and 32."""
+    board_motions: tuple[Annotated[int, Field(ge=4)], ...] | None = None
+    """Numbers of motions of the board. Default: 4, 6, 8, 12, 16, 24, 32; with --quick 6, 12 and 16."""
+    pictures: PictureSettings = PictureSettings()
+    """What is rendered."""
+    run: RunSettings = RunSettings()
+    """How it is run."""
+
+    @property
+    def n_trials(self) -> int:
+        """The paper's 10."""
+        return self.run.trials or (8 if self.run.quick else 10)

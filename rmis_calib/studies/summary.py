@@ -12,8 +12,8 @@ if TYPE_CHECKING:
 KEYS = (
     "noise", "coefficient", "motions", "laparoscope_positions", "instrument_positions", "cameras", "method",
 )  # fmt: skip
-MEASURES = {"rotation": "deg", "translation": "mm", "working_point": "mm"}
-"""Quantities of an error, with their units."""
+MEASURES = {"rotation": "deg", "translation": "mm", "working_point": "mm", "reprojection": "px"}
+"""Quantities of an error, with their units; a study has some of them."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,8 @@ class Group:
     def row(self) -> dict[str, Any]:
         """Flat, for a table."""
         out = dict(self.keys) | {"trials": self.count, "unanswered": self.unanswered}
-        for measure, unit in MEASURES.items():
+        for measure in self.quartiles:
+            unit = MEASURES[measure]
             names = [f"{measure}_{what}_{unit}" for what in ("q25", "median", "q75", "q90")]
             out |= dict(zip(names, self.quartiles[measure], strict=True))
             out |= {
@@ -57,32 +58,27 @@ def summarise(table: "pyarrow.Table", keys: Sequence[str] = KEYS) -> list[Group]
     rows: dict[tuple[Any, ...], list[int]] = {}
     for index, key in enumerate(zip(*columns.values(), strict=True)):
         rows.setdefault(key, []).append(index)
-    values = {
-        name: np.asarray(table.column(name)) for name in table.column_names if name.startswith(tuple(_value_names()))
-    }
+    ends = tuple(f"_error_{unit}" for unit in MEASURES.values())
+    named = [name for name in table.column_names if name.endswith(ends) or name.startswith("bound_")]
+    values = {name: np.asarray(table.column(name)) for name in named}
     return [
         _group(dict(zip(keys, key, strict=True)), {name: value[index] for name, value in values.items()})
         for key, index in rows.items()
     ]
 
 
-def _value_names() -> list[str]:
-    errors = [f"{measure}_error_{unit}" for measure, unit in MEASURES.items()]
-    return errors + [f"bound_{measure}_" for measure in MEASURES]
-
-
 def _group(keys: dict[str, Any], values: Mapping[str, np.ndarray]) -> Group:
-    quartiles, rms, bound_rms, bound_median = {}, {}, {}, {}
-    errors = {measure: values[f"{measure}_error_{unit}"] for measure, unit in MEASURES.items()}
-    for measure, unit in MEASURES.items():
-        error = errors[measure]
+    units = {measure: unit for measure, unit in MEASURES.items() if f"{measure}_error_{unit}" in values}
+    quartiles, rms, bound_rms, bound_median, count, unanswered = {}, {}, {}, {}, 0, 0
+    for measure, unit in units.items():
+        error = values[f"{measure}_error_{unit}"]
         answered = error[np.isfinite(error)]
+        count, unanswered = len(error), max(unanswered, len(error) - len(answered))
         # A quantile between a finite error and an infinite one is infinite: no interpolation across.
         at = np.quantile(error, (0.25, 0.5, 0.75, 0.9), method="linear" if len(answered) == len(error) else "higher")
         quartiles[measure] = tuple(float(x) for x in at)
         rms[measure] = float(np.sqrt(np.mean(answered**2))) if len(answered) else float("inf")
-        bound_rms[measure] = float(values[f"bound_{measure}_rms_{unit}"].mean())
-        bound_median[measure] = float(values[f"bound_{measure}_median_{unit}"].mean())
-    count = len(errors["rotation"])
-    unanswered = int((~np.isfinite(errors["rotation"])).sum())
+        nothing = np.full(1, np.nan)
+        bound_rms[measure] = float(values.get(f"bound_{measure}_rms_{unit}", nothing).mean())
+        bound_median[measure] = float(values.get(f"bound_{measure}_median_{unit}", nothing).mean())
     return Group(keys, count, unanswered, quartiles, rms, bound_rms, bound_median)
