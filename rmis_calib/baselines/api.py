@@ -1,6 +1,6 @@
 """`hand_eye`: one interface to all methods, over one trial or a batch of them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rmis_calib.baselines.adjoint import ata
 from rmis_calib.baselines.closed_form import andreff, daniilidis, horaud, park, tsai
-from rmis_calib.baselines.degeneracy import assess_motion, assess_solution
+from rmis_calib.baselines.degeneracy import MotionAssessment, assess_motion, assess_solution
 from rmis_calib.baselines.inputs import read_remote_centre, read_samples
 from rmis_calib.baselines.motions import Motions, Samples, relative_motions
 from rmis_calib.baselines.noise import noise_levels, propagate, residuals
@@ -83,8 +83,8 @@ def hand_eye(
     setup: str = "eye_in_hand",
     camera_left_T_board: Tensor | np.ndarray | None = None,
     camera_left_T_camera: Tensor | np.ndarray | None = None,
-    base_p_rcm: Tensor | np.ndarray | None = None,
-    board_p_rcm: Tensor | np.ndarray | None = None,
+    base_p_rcm: Tensor | np.ndarray | Sequence[float] | None = None,
+    board_p_rcm: Tensor | np.ndarray | Sequence[float] | None = None,
     covariance: bool = True,
 ) -> HandEye:
     """Hand-eye calibration from poses of the robot and of a board that the camera sees.
@@ -139,21 +139,21 @@ def hand_eye(
 def _solve_chunk(samples: Samples, method: str, centres: list[Tensor | None], covariance: bool) -> dict[str, Tensor]:
     """Fields of the result for some trials."""
     with torch.no_grad():
-        status = assess_motion(samples, relative_motions(samples))
-    good = (status == HandEyeStatus.OK).nonzero()[:, 0]
+        motion = assess_motion(samples, relative_motions(samples))
+    good = (motion.status == HandEyeStatus.OK).nonzero()[:, 0]
     if not len(good):
-        return _unanswered(samples, status, covariance)
+        return _unanswered(samples, motion.status, covariance)
     chosen = Samples(samples.anchor_T_mount[good], samples.camera_T_board[good], samples.cameras)
     anchor_p_rcm, board_p_rcm = (None if centre is None else centre[good] for centre in centres)
     (X, Z), settled = METHODS[method](_Problem(chosen, relative_motions(chosen), anchor_p_rcm, board_p_rcm))
-    answered = _judged(chosen, X.detach(), Z.detach(), settled)
+    answered = _judged(chosen, motion[good], X.detach(), Z.detach(), settled)
     if covariance:
         slopes = _slopes(chosen, method, anchor_p_rcm, board_p_rcm)
         found = residuals(chosen, X.detach(), Z.detach())
         answered["covariance"] = propagate(slopes, noise_levels(found), found.lever, chosen.cameras)
     answered |= {"mount_T_camera": X, "anchor_T_board": Z}
     refused = (answered["status"] != HandEyeStatus.OK) & (answered["status"] != HandEyeStatus.NOT_CONVERGED)
-    fields = _unanswered(samples, status, covariance)
+    fields = _unanswered(samples, motion.status, covariance)
     for name, values in answered.items():
         if name in ("mount_T_camera", "anchor_T_board", "covariance"):
             values = torch.where(refused[:, None, None], torch.nan, values)
@@ -174,10 +174,12 @@ def _unanswered(samples: Samples, status: Tensor, covariance: bool) -> dict[str,
 
 
 @torch.no_grad()
-def _judged(samples: Samples, X: Tensor, Z: Tensor, settled: Tensor | None) -> dict[str, Tensor]:
+def _judged(
+    samples: Samples, motion: MotionAssessment, X: Tensor, Z: Tensor, settled: Tensor | None
+) -> dict[str, Tensor]:
     """Status, residuals and noise levels of solutions."""
     found = residuals(samples, X, Z)
-    status = assess_solution(samples, found)
+    status = assess_solution(samples, motion, found)
     if settled is not None:
         status = torch.where((status == HandEyeStatus.OK) & ~settled, int(HandEyeStatus.NOT_CONVERGED), status)
     noise = noise_levels(found)

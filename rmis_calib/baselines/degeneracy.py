@@ -1,6 +1,7 @@
 """Whether the motion determines the mounting at all, whatever the method; checked before and after solving."""
 
 import math
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
@@ -28,9 +29,30 @@ LARGEST_MISFIT, LARGEST_SHIFT_MISFIT = 0.3, 0.1
 third
 of the motion leaves about a tenth; wrong pairs or directions leave half or more."""
 
+POOR_FIT, POOR_ROTATION = 4.0, 0.01
+"""A solution's mean square misfit of rotations may be this times that of the best one, and this part of the motion."""
 
-def assess_motion(samples: Samples, motions: Motions) -> Int[Tensor, "*batch"]:
-    """A `HandEyeStatus` for every trial, from the motions alone."""
+
+@dataclass(frozen=True, eq=False)
+class MotionAssessment:
+    """What the motions alone say, of every trial.
+
+    Attributes:
+        status: a `HandEyeStatus`.
+        rotation: mean square relative rotation, rad^2.
+        misfit: mean square difference of robot's and camera's relative rotations at the best mounting, rad^2.
+    """
+
+    status: Int[Tensor, "*batch"]
+    rotation: Float[Tensor, "*batch"]
+    misfit: Float[Tensor, "*batch"]
+
+    def __getitem__(self, rows: Tensor) -> "MotionAssessment":
+        return MotionAssessment(self.status[rows], self.rotation[rows], self.misfit[rows])
+
+
+def assess_motion(samples: Samples, motions: Motions) -> MotionAssessment:
+    """Whether the motion can answer, before solving."""
     alpha, beta = rotation_vectors(motions.qa), rotation_vectors(motions.qb)
     profile = alpha.mT @ beta / alpha.shape[-2]
     R = project_to_so3(profile)
@@ -55,7 +77,7 @@ def assess_motion(samples: Samples, motions: Motions) -> Int[Tensor, "*batch"]:
         ((rotation < NO_ROTATION_RAD) & (travel < NO_TRAVEL), HandEyeStatus.IDENTICAL),
     ):
         status = torch.where(condition, int(code), status)
-    return status
+    return MotionAssessment(status, rotation**2, misfit)
 
 
 def _travel(samples: Samples, motions: Motions, axis: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor]:
@@ -67,7 +89,7 @@ def _travel(samples: Samples, motions: Motions, axis: Float[Tensor, "*batch 3"])
     return (square / size).sqrt(), (along / size).sqrt()
 
 
-def assess_solution(samples: Samples, found: Residuals) -> Int[Tensor, "*batch"]:
+def assess_solution(samples: Samples, motion: MotionAssessment, found: Residuals) -> Int[Tensor, "*batch"]:
     """A `HandEyeStatus` for every trial, from what its solution leaves unexplained."""
     robot, camera = (
         (t - t.mean(-2, keepdim=True)).square().sum(-1).mean(-1)
@@ -75,9 +97,13 @@ def assess_solution(samples: Samples, found: Residuals) -> Int[Tensor, "*batch"]
     )
     shift = found.shift.square().sum(-1).mean(-1)
     # What the rotations' own misfit makes of the lever is no disagreement of translations.
-    swing = (found.turn.square().sum(-1) * found.lever.square().sum(-1)).mean(-1)
+    swing = 0.5 * motion.misfit * found.lever.square().sum(-1).mean(-1)
     disagree, ok = int(HandEyeStatus.TRANSLATIONS_DISAGREE), int(HandEyeStatus.OK)
     # The second test is for a robot in metres: it hardly moves, beside a camera that turns far from the board.
     largest = torch.minimum(LARGEST_SHIFT_MISFIT * (robot + camera), robot + 0.01 * camera)
     status = torch.where(shift > largest + 2 * swing, disagree, ok)
+    # A relative rotation has the errors of two samples.
+    turn = found.turn.square().sum(-1).mean(-1)
+    poor = 2 * turn > POOR_FIT * motion.misfit + POOR_ROTATION * motion.rotation
+    status = torch.where(poor, int(HandEyeStatus.POOR_FIT), status)
     return torch.where(torch.isfinite(shift), status, int(HandEyeStatus.NON_FINITE))

@@ -59,7 +59,7 @@ class Motions:
 
     def length(self) -> Float[Tensor, "*batch"]:
         """Size of the translations, root mean square, mm: makes equations that mix lengths and angles free of units."""
-        square = ((self.ta**2).sum(-1) + (self.tb**2).sum(-1)).mean(-1).detach()
+        square = ((self.ta**2).sum(-1) + (self.tb**2).sum(-1)).mean(-1)
         return torch.where(square > 0, square, 1.0).sqrt()
 
 

@@ -11,38 +11,33 @@ from rmis_calib.baselines.robot_world import Transforms, shah
 from rmis_calib.geometry import matrix_to_rotvec, rigid_from_rotation_translation, rotvec_to_matrix, skew
 from rmis_calib.solver.model.batched_linalg import unit_diagonal
 
-_STEPS, _TOLERANCE = 50, 1e-11
-_NOISE_STEPS = 8
-"""Estimates of the noise levels, each followed by two steps. After that the levels are held, so that it converges."""
+_STEPS, _TOLERANCE = 200, 1e-9
 
 
 def refine(samples: Samples) -> tuple[Transforms, Bool[Tensor, "*batch"]]:
     """(mount_T_camera, anchor_T_board), and whether the iteration settled.
 
-    Gauss-Newton over both transforms, starting from `shah` and alternating with estimates of the noise levels.
-    Derivatives take the levels as given.
+    Gauss-Newton over both transforms from `shah`; every step uses the noise levels of the residuals where it starts.
 
     Source: the equation is A X = Z B as in `shah`, the noise model is in noise.py; Nocedal & Wright, Numerical
     Optimization, ch. 10.
     """
     X, Z = (transform.detach() for transform in shah(samples))
-    for _ in range(_NOISE_STEPS):
-        with torch.no_grad():
-            levels = noise_levels(residuals(samples, X, Z))
-            for _ in range(2):
-                X, Z = moved(X, Z, gauss_newton_step(samples, X, Z, levels))
     length = residuals(samples, X, Z).lever.detach().norm(dim=-1).mean(-1)
     scales = torch.stack([torch.ones_like(length), length] * 2, -1).repeat_interleave(3, -1)
-    # x is the step from here, with lengths divided by the lever's.
-    data = (samples.anchor_T_mount, samples.camera_T_board, X, Z, scales, *vars(levels).values())
+    # x is the step from the start, with lengths divided by the lever's.
+    data = (samples.anchor_T_mount, samples.camera_T_board, X, Z, scales)
     x, settled = fixed_point(_update, torch.zeros_like(scales), data, steps=_STEPS, tolerance=_TOLERANCE)
     return moved(X, Z, x * scales), settled
 
 
-def _update(x: Tensor, *data: Tensor) -> Tensor:
-    """The next x of `refine`."""
-    anchor_T_mount, camera_T_board, X, Z, scales, *levels = data
-    step = gauss_newton_step(Samples(anchor_T_mount, camera_T_board), *moved(X, Z, x * scales), NoiseLevels(*levels))
+def _update(
+    x: Tensor, anchor_T_mount: Tensor, camera_T_board: Tensor, X: Tensor, Z: Tensor, scales: Tensor
+) -> Float[Tensor, "*batch 12"]:
+    """The next x of `refine`: a Gauss-Newton step with the noise levels of the residuals at x."""
+    samples = Samples(anchor_T_mount, camera_T_board)
+    X, Z = moved(X, Z, x * scales)
+    step = gauss_newton_step(samples, X, Z)
     turns = [
         matrix_to_rotvec(rotvec_to_matrix(step[..., k : k + 3]) @ rotvec_to_matrix(x[..., k : k + 3])) for k in (0, 6)
     ]
@@ -62,13 +57,13 @@ def moved(
 
 
 def gauss_newton_step(
-    samples: Samples, X: Float[Tensor, "*batch 4 4"], Z: Float[Tensor, "*batch 4 4"], levels: NoiseLevels
+    samples: Samples, X: Float[Tensor, "*batch 4 4"], Z: Float[Tensor, "*batch 4 4"]
 ) -> Float[Tensor, "*batch 12"]:
-    """Step of X and Z, as in `moved`, for noise of given levels."""
+    """Step of X and Z, as in `moved`, weighted by the noise levels of the residuals."""
     found = residuals(samples, X, Z)
     turning, shifting = _jacobian(samples, X, Z)
     turn, shift = found.turn[..., None], found.shift[..., None]
-    share, shift_weight = _weights(levels, found)
+    share, shift_weight = _weights(noise_levels(found), found)
     # The robot's share of the turn moves the board by its lever: with that off the shift, both are independent.
     S = -share[..., None, None, None] * skew(found.lever)
     shifting, shift = shifting - S @ turning, shift - S @ turn

@@ -65,5 +65,5 @@ def li(samples: Samples) -> Transforms:
 
 def _travel(*shifts: Float[Tensor, "*batch n 3"]) -> Float[Tensor, "*batch"]:
     """Root mean square distance from the mean position, mm; 1 where nothing moves."""
-    square = torch.stack([(t - t.mean(-2, keepdim=True)).square().sum(-1).mean(-1) for t in shifts]).sum(0).detach()
+    square = torch.stack([(t - t.mean(-2, keepdim=True)).square().sum(-1).mean(-1) for t in shifts]).sum(0)
     return torch.where(square > 0, square, 1.0).sqrt()

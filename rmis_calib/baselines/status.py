@@ -14,8 +14,9 @@ class HandEyeStatus(IntEnum):
     PLANAR = 5
     ROTATIONS_DISAGREE = 6
     TRANSLATIONS_DISAGREE = 7
-    NOT_CONVERGED = 8
-    NON_FINITE = 9
+    POOR_FIT = 8
+    NOT_CONVERGED = 9
+    NON_FINITE = 10
 
     @property
     def sentence(self) -> str:
@@ -47,6 +48,9 @@ _SENTENCES = {
     ),
     HandEyeStatus.TRANSLATIONS_DISAGREE: (
         "the rotations fit but the translations do not; check the units and the direction of the transforms"
+    ),
+    HandEyeStatus.POOR_FIT: (
+        "this method's solution fits far worse than the motions allow (with rcm: check the remote centre's coordinates)"
     ),
     HandEyeStatus.NOT_CONVERGED: "the iteration did not settle",
     HandEyeStatus.NON_FINITE: "the equations have no finite solution",

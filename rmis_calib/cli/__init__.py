@@ -23,6 +23,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "study": ("Study", "Monte-Carlo studies: the paper's experiments and your own robot (noise, motions, plan, ...)"),
     "solve": ("Solve", "estimate camera_right_T_arm from an observations file (.npz)"),
     "export": ("Export", "write a result as another program reads it: dVRK, ROS, MoveIt, OpenCV, URDF and more"),
+    "baseline": ("Baseline", "hand-eye calibration with a board: published methods side by side, from pairs of poses"),
     "evaluate": ("Evaluate", "measure a result against head points and against a truth file"),
     "convert": ("Convert", "make a recording of a ROS bag, a dVRK session, a data set, or pictures with a table"),
     "view": ("View", "show arms, cameras, shaft and uncertainty in a browser, motion by motion"),

@@ -11,6 +11,7 @@ from pydantic import ValidationError
 
 from rmis_calib.batches.settings import BatchSettings
 from rmis_calib.cli import EXIT_OK
+from rmis_calib.cli.baseline_command import Baseline as Baseline
 from rmis_calib.cli.batch_console import (
     batch_reporter,
     conclude_batch,

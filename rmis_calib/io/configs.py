@@ -45,16 +45,26 @@ def load_yaml(path: str | Path, error: type[InputError] = ConfigError) -> dict[s
         FileError: the file is absent or unreadable.
         ConfigError: (or the `error` given) it is not YAML, or not a mapping; names the line.
     """
-    raw = read_bytes(path, LARGEST_YAML)
-    try:
-        # Thousands of nested brackets end in a recursion error, thousands of digits in a value error.
-        value = yaml.load(raw.decode("utf-8-sig"), Loader=_Yaml12Loader)
-    except (yaml.YAMLError, ValueError, RecursionError) as problem:
-        raise _yaml_error(path, problem, error) from problem
+    value = load_yaml_value(path, error)
     if not isinstance(value, dict):
         found = "an empty file" if value is None else type(value).__name__
         raise error(where=str(path), expected="a mapping of keys to values", found=found)
     return value
+
+
+def load_yaml_value(path: str | Path, error: type[InputError] = ConfigError) -> Any:
+    """Whatever a YAML file holds, read as `load_yaml` does: a mapping, a list, ...
+
+    Raises:
+        FileError: the file is absent or unreadable.
+        ConfigError: (or the `error` given) it is not YAML; names the line.
+    """
+    raw = read_bytes(path, LARGEST_YAML)
+    try:
+        # Thousands of nested brackets end in a recursion error, thousands of digits in a value error.
+        return yaml.load(raw.decode("utf-8-sig"), Loader=_Yaml12Loader)
+    except (yaml.YAMLError, ValueError, RecursionError) as problem:
+        raise _yaml_error(path, problem, error) from problem
 
 
 def yaml_value(text: str) -> Any:

@@ -20,6 +20,7 @@ MARKER = ".rmis-calib-output.json"
 MARKER_FORMAT = "rmis-calib-output/1"
 RESULT_FORMAT: Final = "rmis-calib-result/1"
 EVALUATION_FORMAT = "rmis-calib-evaluation/1"
+BASELINE_FORMAT = "rmis-calib-baseline/1"
 OBSERVATIONS_FORMAT = "rmis-calib-observations/1"
 HTML_GENERATOR = '<meta name="generator" content="rmis-calib">'
 _HEAD_BYTES = 4096

@@ -60,7 +60,7 @@ def scene(
         rng.normal(size=(count, poses, 3)) * travel_mm if shifts is None else np.broadcast_to(shifts, (count, poses, 3))
     )
     first = pose(Rotation.random(count, rng), rng.normal(size=(count, 3)) * 100.0)[:, None]
-    A = first @ pose(Rotation.from_rotvec(turns.reshape(-1, 3)), shifts)
+    A = first @ pose(Rotation.from_rotvec(np.array(turns).reshape(-1, 3)), shifts)
     C = np.linalg.inv(A @ X[:, None]) @ Z[:, None]
     return Scene(*(values.reshape(*trials, *values.shape[1:]) for values in (A, C, X, Z)))
 

@@ -46,18 +46,18 @@ def test_noise_does_not_hide_it(motion: str, noise: str, poses: int) -> None:
         np.arange(poses) // N
     )  # more poses: the same motion again, a little different
     turns, shifts = (values[rows.astype(int)] * (1 + rows - rows.astype(int))[:, None] for values in (turns, shifts))
-    data = noisy(scene(2, poses, trials=(200,), turns=turns, shifts=shifts), 3, **NOISE[noise])
+    data = noisy(scene(2, poses, trials=(60,), turns=turns, shifts=shifts), 3, **NOISE[noise])
     found = data.solve("park", covariance=False)
     named = np.mean([bool(words) for words in found.degeneracy()])
-    assert named >= 0.995, f"{named:.3f} of the trials named"
+    assert named >= 0.98, f"{named:.3f} of the trials named"
 
 
 @pytest.mark.parametrize("angle", [0.06, 0.17, 0.5])
-@pytest.mark.parametrize("poses", [8, 20, 100])
+@pytest.mark.parametrize("poses", [8, 20, 60])
 def test_motion_that_can_answer_is_answered(angle: float, poses: int) -> None:
     noise = (0.05 * angle, 0.2)
-    data = noisy(scene(4, poses, trials=(100,), angle=angle), 5, camera=noise, robot=noise)
-    assert data.solve("park", covariance=False).ok.double().mean() >= 0.99
+    data = noisy(scene(4, poses, trials=(40,), angle=angle), 5, camera=noise, robot=noise)
+    assert data.solve("park", covariance=False).ok.double().mean() >= 0.97
 
 
 def test_the_papers_middle_noise_is_answered_from_many_motions() -> None:
@@ -103,6 +103,6 @@ def test_one_bad_trial_leaves_its_neighbours_alone() -> None:
     broken[1] = broken[1, 0]
     for method in METHODS:
         data = Scene(broken, exact.camera_T_board, exact.flange_T_camera, exact.base_T_board)
-        found = data.solve(method)
+        found = data.solve(method, covariance=False)
         assert found.ok.tolist() == [True, False, True]
         np.testing.assert_allclose(found.flange_T_camera[::2].numpy(), exact.flange_T_camera[::2], atol=1e-9)
