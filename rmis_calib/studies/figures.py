@@ -113,7 +113,7 @@ def _ticks(values: list[float]) -> list[float]:
     kept: list[float] = []
     span = np.log(values[-1] / values[0]) if len(values) > 1 else 1.0
     for value in values:
-        if not kept or np.log(value / kept[-1]) > 0.13 * span:
+        if not kept or np.log(value / kept[-1]) > 0.17 * span:
             kept.append(value)
     return kept
 
