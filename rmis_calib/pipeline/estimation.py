@@ -86,7 +86,8 @@ def solve(
         solution, notes = estimate(observations, config, measurements), ()
     else:
         solution, notes = estimate_with_kinematics(observations, config, unknowns, measurements=measurements)
-    motions = Motions(*used_motions(solution))
+    used, reasons = used_motions(solution)
+    motions = Motions(used, tuple(reasons.tolist()))
     residuals, columns = residuals_normalised(solution, motions.used), () if unknowns is None else unknowns.columns
     for item in measurements:
         if item.name in solution.residual_own:

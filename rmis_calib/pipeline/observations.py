@@ -11,6 +11,7 @@ from rmis_calib.io import Recording, ShaftObservations
 from rmis_calib.pipeline.association import Choice, reversed_direction
 from rmis_calib.pipeline.detection import View
 from rmis_calib.pipeline.poses import MotionPoses
+from rmis_calib.pipeline.words import sentences
 from rmis_calib.solver import Problem
 from rmis_calib.vision import FrameReason, ShaftDetections
 
@@ -79,17 +80,14 @@ def head_observations(recording: Recording, poses: MotionPoses) -> dict[str, Any
     return arrays
 
 
-def reasons_for(view: View, poses: MotionPoses, choice: Choice) -> list[str]:
+def reasons_for(view: View, poses: MotionPoses, choice: Choice) -> np.ndarray:
     """(M,) why a motion has no shaft in this view; empty where it has one."""
     found = view.at(poses.frames)
-    codes, taken = found.reason.cpu().numpy(), choice.taken.cpu().numpy()
-    known = (found.valid & found.direction_known).any(-1).cpu().numpy()
-    sentences = np.where(known, ANOTHER_INSTRUMENT, DIRECTION_UNKNOWN)
-    seen = found.valid.any(-1).cpu().numpy()
-    return [
-        "" if is_taken else (str(sentence) if is_seen else FrameReason(int(code)).sentence)
-        for code, is_seen, is_taken, sentence in zip(codes, seen, taken, sentences, strict=True)
-    ]
+    reasons = sentences(list(FrameReason), found.reason)
+    reasons[found.valid.any(-1).cpu().numpy()] = DIRECTION_UNKNOWN
+    reasons[(found.valid & found.direction_known).any(-1).cpu().numpy()] = ANOTHER_INSTRUMENT
+    reasons[choice.taken.cpu().numpy()] = ""
+    return reasons
 
 
 def _measured(side: str, detections: ShaftDetections, choice: Choice, model_sigma: float) -> dict[str, np.ndarray]:

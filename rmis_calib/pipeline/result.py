@@ -12,7 +12,7 @@ from rmis_calib.pipeline.association import Choice
 from rmis_calib.pipeline.detection import View
 from rmis_calib.pipeline.observations import reasons_for
 from rmis_calib.pipeline.poses import MotionPoses
-from rmis_calib.pipeline.words import ranges_in_words
+from rmis_calib.pipeline.words import ranges_in_words, sentences
 from rmis_calib.results import (
     INTRINSICS,
     JOINT_OFFSET,
@@ -149,11 +149,12 @@ def _strange_unknown(solution: Solution) -> str:
     return f"{where}: are the cameras swapped, is a unit or a file wrong, or the clock off?"
 
 
-def used_motions(solution: Solution) -> tuple[np.ndarray, tuple[str, ...]]:
-    """(N,) whether each motion of the solve was used, and why not."""
-    codes = [MotionReason(int(code)) for code in solution.reason.cpu()]
-    used = np.array([code in (MotionReason.USED, MotionReason.OUTLIER_ONE_CAMERA) for code in codes])
-    return used, tuple("" if code is MotionReason.USED else code.sentence for code in codes)
+def used_motions(solution: Solution) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) whether each motion of the solve was used, and why not; empty for one used without reservation."""
+    codes = solution.reason.cpu().numpy()
+    reasons = sentences(list(MotionReason), solution.reason)
+    reasons[codes == MotionReason.USED] = ""
+    return np.isin(codes, (MotionReason.USED, MotionReason.OUTLIER_ONE_CAMERA)), reasons
 
 
 def residuals_normalised(solution: Solution, used: np.ndarray) -> dict[str, Residual]:
@@ -329,19 +330,14 @@ def motions_of(
     solution: Solution | None,
 ) -> Motions:
     """Used and rejected frames, each rejected one with its first reason."""
+    by_view = np.stack([reasons_for(view, poses, choice) for view, choice in zip(views, choices, strict=True)])
+    seen = (by_view == "").any(axis=0)
+    solved, said = (False, TOO_FEW) if solution is None else used_motions(solution)
     used = np.zeros(recording.n_frames, dtype=bool)
-    reasons = [JOINTS_UNKNOWN] * recording.n_frames
-    by_view = [reasons_for(view, poses, choice) for view, choice in zip(views, choices, strict=True)]
-    solved, solver_reasons = (None, None) if solution is None else used_motions(solution)
-    for motion, frame in enumerate(poses.frames):
-        missing = [view_reasons[motion] for view_reasons in by_view]
-        if all(missing):
-            reasons[frame] = missing[0]
-        elif solved is None or solver_reasons is None:
-            reasons[frame] = TOO_FEW
-        else:
-            used[frame], reasons[frame] = bool(solved[motion]), solver_reasons[motion]
-    return Motions(used, tuple(reasons), recording.frame_times_s)
+    used[poses.frames] = seen & solved
+    reasons = np.full(recording.n_frames, JOINTS_UNKNOWN, dtype=object)
+    reasons[poses.frames] = np.where(seen, said, by_view[0])
+    return Motions(used, tuple(reasons.tolist()), recording.frame_times_s)
 
 
 def residuals_px(recording: Recording, poses: MotionPoses, solution: Solution, used: np.ndarray) -> dict[str, Residual]:
