@@ -10,7 +10,7 @@ from typing import Any, Literal
 from pydantic import ConfigDict, TypeAdapter, ValidationError, field_validator
 from pydantic.dataclasses import dataclass
 
-from rmis_calib.errors import ConfigError, InputError
+from rmis_calib.errors import ConfigError
 from rmis_calib.io.configs import config_path, load_yaml
 from rmis_calib.io.validation import first_finding
 from rmis_calib.solver.settings import SolverSettings
@@ -115,12 +115,7 @@ def parse_config(raw: dict[str, Any], where: str = "config") -> CalibrationConfi
     try:
         return TypeAdapter(CalibrationConfig).validate_python(raw)
     except ValidationError as error:
-        raise config_error(error, where) from None
-
-
-def config_error(error: ValidationError, where: str) -> InputError:
-    """The first of pydantic's complaints in our words."""
-    return first_finding(error, CalibrationConfig, where, ConfigError)
+        raise first_finding(error, CalibrationConfig, where, ConfigError) from None
 
 
 def load_config(name_or_path: str | Path) -> CalibrationConfig:

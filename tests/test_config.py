@@ -2,6 +2,7 @@
 
 import pytest
 
+from rmis_calib.cli.commands import parse
 from rmis_calib.config import CalibrationConfig, load_config, parse_config
 from rmis_calib.errors import ConfigError, FileError, InputError
 from rmis_calib.io import config_names
@@ -35,6 +36,42 @@ def test_mistakes_are_named(raw, words):
         parse_config(raw, where="my.yaml")
     assert all(word in str(caught.value) for word in ["my.yaml", *words])
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("raw", "option", "words"),
+    [
+        ({"solver": {"grid": 3}}, ["--solver.grid", "3"], "expected 24 or more, found 3"),
+        ({"solver": {"noise": {"image": -1}}}, ["--solver.noise.image", "-1"], "expected more than 0, found -1"),
+        ({"edge_bias_px": -1}, ["--edge-bias-px", "-1"], "expected 0 or more, found -1"),
+        (
+            {"solver": {"verdict": {"trustworthy_mm": 30}}},
+            ["--solver.verdict.trustworthy-mm", "30"],
+            "expected trustworthy_mm at most unobservable_mm, found 30 and 10",
+        ),
+    ],
+)
+def test_a_file_and_an_option_are_refused_in_the_same_words(raw, option, words):
+    with pytest.raises(ConfigError) as of_file:
+        parse_config(raw, where="my.yaml")
+    with pytest.raises(ConfigError) as of_option:
+        parse("Solve", "solve", ["observations.npz", *option])
+    assert words in str(of_file.value) and words in str(of_option.value)
+
+
+@pytest.mark.parametrize(
+    ("raw", "words"),
+    [
+        ({"solver": {"verdict": {"working_point_mm": [1.0, 2.0]}}}, "working_point_mm: expected 3 entries, found [1.0"),
+        ({"solver": {"verdict": {"working_point_mm": [1.0] * 4}}}, "working_point_mm: expected 3 entries, found [1.0"),
+        ({"instrument_at": [1, 2.0]}, "instrument_at: expected 3 entries, found [1, 2.0]"),
+        ({"mask_labels": 3}, "mask_labels: expected a list, found 3"),
+    ],
+)
+def test_lists_of_another_length_say_which_is_meant(raw, words):
+    with pytest.raises(ConfigError) as caught:
+        parse_config(raw)
+    assert words in str(caught.value)
 
 
 def test_yaml_file(tmp_path):

@@ -9,10 +9,9 @@ from typing import Any
 import tyro
 from pydantic import ValidationError
 
-from rmis_calib.config import config_error
 from rmis_calib.errors import ConfigError, InputError
 from rmis_calib.io.configs import did_you_mean
-from rmis_calib.io.validation import expectation
+from rmis_calib.io.validation import finding_of_option
 
 _FLAG = re.compile(r"(--[a-z][a-z0-9.-]*)")
 
@@ -30,11 +29,24 @@ def parse_arguments(kind: type, argv: Sequence[str], prog: str, default: Any = N
         with contextlib.redirect_stderr(printed):
             return tyro.cli(kind, args=list(argv), prog=prog, default=default, description=kind.__doc__)
     except ValidationError as error:  # of the settings as a whole; tyro reports those of single groups itself
-        raise config_error(error, prog) from None
+        raise finding_of_option(error, "", ConfigError) from None
     except SystemExit as request:
         if not request.code:
             raise
-        raise _in_our_words(_unboxed(printed.getvalue()), argv, prog) from None
+        lines = _unboxed(printed.getvalue())
+        raise _of_a_group(request, lines) or _in_our_words(lines, argv, prog) from None
+
+
+def _of_a_group(request: BaseException, lines: list[str]) -> InputError | None:
+    """What pydantic found in a group of settings, which tyro passes on as text; None where it found nothing."""
+    cause: BaseException | None = request
+    while cause is not None and not isinstance(cause, ValidationError):
+        cause = cause.__cause__ or cause.__context__
+    if cause is None:
+        return None
+    # The first part of a group's name is the command's own field for all settings, which options do not name.
+    group = re.search(r"Error parsing \w+\.?([\w.]*)", " ".join(lines))
+    return finding_of_option(cause, group[1] if group else "", ConfigError)
 
 
 def _unboxed(text: str) -> list[str]:
@@ -67,15 +79,6 @@ def _in_our_words(lines: list[str], argv: Sequence[str], prog: str) -> InputErro
     missing_value = re.search(r"Missing value for argument '(.*?)'", text)
     if missing_value:
         return InputError(where=missing_value[1], expected="a value after it", found="nothing")
-    nested = re.search(r"Error parsing settings\.?([\w.]*): \d+ validation errors? for \w+ (\w+) .*?type=(\w+)", text)
-    if nested:
-        value = re.search(r"input_value=(.*?), input_type", text)
-        bound = re.search(r"(?:than or equal to|than|equal to) (-?[\d.e+-]+)", text)
-        expected = expectation(nested[3], {"bound": bound[1].rstrip(".")} if bound else {})
-        where = ".".join(part for part in (nested[1], nested[2]) if part)
-        return ConfigError(
-            where=f"--{where.replace('_', '-')}", expected=expected, found=value[1] if value else "another"
-        )
     parsing = re.search(r"Error parsing (--[\w.-]+)", text)
     if parsing:
         flag = parsing[1]

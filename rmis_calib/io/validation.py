@@ -1,11 +1,9 @@
 """What pydantic finds wrong, in our words: file, key path, expected, found, and the nearest known key."""
 
 import difflib
-from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
-from typing import Annotated, Any, TypeVar, get_args, get_origin
+from typing import Any, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from rmis_calib.errors import InputError
 
@@ -38,25 +36,11 @@ _BOUNDS = {
     "greater_than_equal": ("ge", "{} or more"),
     "less_than": ("lt", "less than {}"),
     "less_than_equal": ("le", "{} or less"),
-    "too_short": ("min_length", "{} entries or more"),
-    "too_long": ("max_length", "{} entries or fewer"),
     "literal_error": ("expected", "{}"),
+    "enum": ("expected", "{}"),
 }
+_LENGTHS = {"too_short": ("min_length", "{} or more"), "too_long": ("max_length", "{} or fewer")}
 _UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
-
-
-def expectation(kind: str, context: Mapping[str, Any]) -> str:
-    """What was expected, in words, where pydantic reports an error of this kind.
-
-    Args:
-        kind: pydantic's `type` of the error.
-        context: its `ctx`; or `{"bound": number}` where only the number is known.
-    """
-    if kind in _BOUNDS:
-        name, words = _BOUNDS[kind]
-        bound = context.get(name, context.get("bound", "?"))
-        return words.format(f"{bound:g}" if isinstance(bound, float) else bound)
-    return _EXPECTED.get(kind, "another value")
 
 
 def validate(model: type[Model], raw: dict[str, Any], where: str, error: type[InputError]) -> Model:
@@ -71,15 +55,38 @@ def validate(model: type[Model], raw: dict[str, Any], where: str, error: type[In
         raise first_finding(problem, model, where, error) from None
 
 
-def first_finding(problem: ValidationError, schema: type, where: str, error: type[InputError]) -> InputError:
-    """The first of pydantic's findings as one of our errors.
+def first_finding(problem: ValidationError, schema: Any, where: str, error: type[InputError]) -> InputError:
+    """The first of pydantic's findings as one of our errors: file, key, expected, found.
 
     Args:
         problem: what pydantic raised.
-        schema: the model or dataclass that it validated, for the keys that it knows.
+        schema: the model or dataclass that it validated, for the keys and lengths that it knows.
         where: the file, or whatever was validated.
         error: class of the error.
     """
+    key, expected, found = _first(problem, schema)
+    return _as_error(error, f"{where}: {key}" if key else where, expected, found)
+
+
+def finding_of_option(problem: ValidationError, group: str, error: type[InputError]) -> InputError:
+    """The same for command-line options.
+
+    Args:
+        problem: of one group of settings.
+        group: dotted name of the group, empty for the options that are in none.
+        error: class of the error.
+    """
+    key, expected, found = _first(problem, None)
+    option = ".".join(part for part in (group, key) if part).replace("_", "-")
+    return _as_error(error, f"--{option}", expected, found)
+
+
+def _as_error(error: type[InputError], where: str, expected: str | None, found: str) -> InputError:
+    return error(found, where=where) if expected is None else error(where=where, expected=expected, found=found)
+
+
+def _first(problem: ValidationError, schema: Any) -> tuple[str, str | None, str]:
+    """The first finding: its dotted key, what was expected, and what was found and how many more there are."""
     # An unknown key first: a misspelt one is also reported as missing, which helps less.
     findings = sorted(problem.errors(), key=lambda finding: finding["type"] not in _UNKNOWN_KEY)
     finding, more = findings[0], len(findings) - 1
@@ -87,24 +94,38 @@ def first_finding(problem: ValidationError, schema: type, where: str, error: typ
     loc = tuple(
         part for part in finding["loc"] if part != "[key]" and not str(part).startswith(("tuple[", "function-"))
     )
-    key = ".".join(str(part) for part in loc)
-    place = f"{where}: {key}" if key else where
-    tail = f" (and {more} more)" if more else ""
-    kind = finding["type"]
+    if finding["type"] == "missing" and loc and isinstance(loc[-1], int):  # an entry of a list of a fixed length
+        loc, finding = loc[:-1], finding | {"type": "too_short"}
+    expected, found = _expected_and_found(finding, loc, _Keys(schema))
+    return ".".join(str(part) for part in loc), expected, f"{found} (and {more} more)" if more else found
+
+
+def _expected_and_found(finding: Any, loc: tuple[int | str, ...], keys: "_Keys") -> tuple[str | None, str]:
+    """What was expected and what was found; None and a whole sentence where a check of ours says both."""
+    kind, context, found = finding["type"], finding.get("ctx") or {}, _short(finding["input"])
     if kind in _UNKNOWN_KEY:
-        known = sorted(_known_keys(schema, loc[:-1]))
+        known = sorted(keys.at(loc[:-1]))
         near = difflib.get_close_matches(str(loc[-1]), known, n=1)
         hint = f" (did you mean {near[0]}?)" if near else f" (known: {', '.join(known)})" if known else ""
-        return error(where=place, expected="a known key", found=f"an unknown one{hint}{tail}")
+        return "a known key", f"an unknown one{hint}"
     if kind == "missing":
-        return error(where=place, expected="this key", found=f"nothing{tail}")
+        return "this key", "nothing"
     if kind == "value_error":
-        text = str(finding.get("ctx", {}).get("error", ""))
-        if text.startswith(("expected ", "looks ")):
-            return error(f"{text}{tail}", where=place)
-        return error(where=place, expected=text, found=f"{_short(finding['input'])}{tail}")
-    expected = expectation(kind, finding.get("ctx") or {})
-    return error(where=place, expected=expected, found=f"{_short(finding['input'])}{tail}")
+        text = str(context.get("error", ""))
+        return (None, text) if "expected " in text or text.startswith("looks ") else (text, found)
+    if kind in _LENGTHS:
+        name, words = _LENGTHS[kind]
+        exact = keys.length(loc)
+        return (words.format(_entries(context.get(name, "?"))) if exact is None else _entries(exact)), found
+    if kind in _BOUNDS:
+        name, words = _BOUNDS[kind]
+        bound = context[name]
+        return words.format(f"{bound:g}" if isinstance(bound, float) else bound), found
+    return _EXPECTED.get(kind, "another value"), found
+
+
+def _entries(count: Any) -> str:
+    return "1 entry" if count == 1 else f"{count} entries"
 
 
 def _short(value: Any) -> str:
@@ -112,30 +133,41 @@ def _short(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _known_keys(schema: Any, loc: tuple[int | str, ...]) -> set[str]:
-    """Keys that the model or dataclass reached by `loc` accepts."""
-    node: Any = schema
-    for part in loc:
-        annotations = _fields_of(node)
-        node = _unwrap(annotations[str(part)] if str(part) in annotations else _item_type(node))
-    return set(_fields_of(node))
+class _Keys:
+    """Keys and lengths that a model or dataclass accepts, from its JSON schema; nothing is known without one."""
+
+    def __init__(self, schema: Any) -> None:
+        self._root: dict[str, Any] = {} if schema is None else TypeAdapter(schema).json_schema()
+
+    def at(self, loc: tuple[int | str, ...]) -> set[str]:
+        """Keys that are known at a place."""
+        return {key for node in self._nodes(loc) for key in node.get("properties", {})}
+
+    def length(self, loc: tuple[int | str, ...]) -> int | None:
+        """Length of the list at a place, where it can have only one."""
+        lists = [node for node in self._nodes(loc) if node.get("type") == "array"]
+        lengths = {node.get(key) for node in lists for key in ("minItems", "maxItems")}
+        return lengths.pop() if len(lengths) == 1 else None
+
+    def _nodes(self, loc: tuple[int | str, ...]) -> list[dict[str, Any]]:
+        """What may stand at a place: more than one schema for a union."""
+        nodes = self._options(self._root)
+        for part in loc:
+            nodes = [option for node in nodes for option in self._options(_child(node, part))]
+        return nodes
+
+    def _options(self, node: dict[str, Any]) -> list[dict[str, Any]]:
+        if "$ref" in node:
+            return self._options(self._root["$defs"][node["$ref"].rpartition("/")[2]])
+        return [option for each in node["anyOf"] for option in self._options(each)] if "anyOf" in node else [node]
 
 
-def _fields_of(node: Any) -> dict[str, Any]:
-    if isinstance(node, type) and issubclass(node, BaseModel):
-        return {name: field.annotation for name, field in node.model_fields.items()}
-    return {field.name: field.type for field in fields(node)} if is_dataclass(node) else {}
-
-
-def _unwrap(node: Any) -> Any:
-    """`X` of `Annotated[X, ...]` and of `X | None`."""
-    if get_origin(node) is Annotated:
-        return _unwrap(get_args(node)[0])
-    options = [option for option in get_args(node) if option is not type(None)]
-    is_optional = type(None) in get_args(node)
-    return _unwrap(options[0]) if is_optional and options else node
-
-
-def _item_type(node: Any) -> Any:
-    """Value type of a dict or a list."""
-    return get_args(node)[-1] if get_args(node) else Any
+def _child(node: dict[str, Any], part: int | str) -> dict[str, Any]:
+    """Schema of an entry of a list, or of a key; empty where nothing is said of it."""
+    if isinstance(part, int):
+        fixed = node.get("prefixItems", ())
+        child = fixed[part] if part < len(fixed) else node.get("items", {})
+    else:
+        any_key = [*node.get("patternProperties", {}).values(), node.get("additionalProperties", {})]
+        child = node.get("properties", {}).get(part, any_key[0])
+    return child if isinstance(child, dict) else {}

@@ -11,7 +11,7 @@ from rmis_calib.io import Recording, ShaftObservations
 from rmis_calib.pipeline.association import Choice, reversed_direction
 from rmis_calib.pipeline.detection import View
 from rmis_calib.pipeline.poses import MotionPoses
-from rmis_calib.pipeline.words import sentences
+from rmis_calib.pipeline.words import words_of
 from rmis_calib.solver import Problem
 from rmis_calib.vision import FrameReason, ShaftDetections
 
@@ -83,7 +83,7 @@ def head_observations(recording: Recording, poses: MotionPoses) -> dict[str, Any
 def reasons_for(view: View, poses: MotionPoses, choice: Choice) -> np.ndarray:
     """(M,) why a motion has no shaft in this view; empty where it has one."""
     found = view.at(poses.frames)
-    reasons = sentences(list(FrameReason), found.reason)
+    reasons = words_of(found.reason, [reason.sentence for reason in FrameReason])
     reasons[found.valid.any(-1).cpu().numpy()] = DIRECTION_UNKNOWN
     reasons[(found.valid & found.direction_known).any(-1).cpu().numpy()] = ANOTHER_INSTRUMENT
     reasons[choice.taken.cpu().numpy()] = ""

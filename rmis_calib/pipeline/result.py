@@ -12,7 +12,7 @@ from rmis_calib.pipeline.association import Choice
 from rmis_calib.pipeline.detection import View
 from rmis_calib.pipeline.observations import reasons_for
 from rmis_calib.pipeline.poses import MotionPoses
-from rmis_calib.pipeline.words import ranges_in_words, sentences
+from rmis_calib.pipeline.words import ranges_in_words, words_of
 from rmis_calib.results import (
     INTRINSICS,
     JOINT_OFFSET,
@@ -152,7 +152,7 @@ def _strange_unknown(solution: Solution) -> str:
 def used_motions(solution: Solution) -> tuple[np.ndarray, np.ndarray]:
     """(N,) whether each motion of the solve was used, and why not; empty for one used without reservation."""
     codes = solution.reason.cpu().numpy()
-    reasons = sentences(list(MotionReason), solution.reason)
+    reasons = words_of(solution.reason, [reason.sentence for reason in MotionReason])
     reasons[codes == MotionReason.USED] = ""
     return np.isin(codes, (MotionReason.USED, MotionReason.OUTLIER_ONE_CAMERA)), reasons
 

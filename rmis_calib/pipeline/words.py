@@ -1,7 +1,6 @@
 """Lists and codes in words."""
 
 from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
 from torch import Tensor
@@ -10,19 +9,9 @@ NAMED_RANGES = 4
 """Ranges that are named; the rest of many is left out."""
 
 
-class _Code(Protocol):
-    @property
-    def sentence(self) -> str: ...
-
-
-def sentences(kind: Sequence[_Code], codes: Tensor) -> np.ndarray:
-    """The sentence of each code, as objects.
-
-    Args:
-        kind: members by their code: those of an enumeration from 0 on.
-        codes: (N,) whole numbers.
-    """
-    return np.array([member.sentence for member in kind], dtype=object)[codes.cpu().numpy()]
+def words_of(codes: Tensor, words: Sequence[str]) -> np.ndarray:
+    """(N,) the words that each code, a number from 0 on, stands for, as objects."""
+    return np.array(words, dtype=object)[codes.cpu().numpy()]
 
 
 def joined(parts: list[str]) -> str:

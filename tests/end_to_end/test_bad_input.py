@@ -177,9 +177,12 @@ def test_output_below_a_file_cannot_be_written(recording, tmp_path, capsys):
         (["calibrate", "nowhere", "--out", "o", "--config", "absent.yaml"], "absent.yaml"),
         (
             ["detect", "nowhere", "--out", "o", "--every", "0"],
-            "every: expected 1 or more, found 0",
+            "--every: expected 1 or more, found 0",
         ),
-        (["calibrate", "nowhere", "--out", "o", "--edge-bias-px", "-1"], "edge_bias_px"),
+        (
+            ["calibrate", "nowhere", "--out", "o", "--edge-bias-px", "-1"],
+            "--edge-bias-px: expected 0 or more, found -1",
+        ),
         (["solve", "absent.npz", "--out", "o.json"], "absent.npz"),
         (["evaluate", "absent.json", "nowhere"], "absent.json"),
         (["detect", "absent.mp4", "--out", "o"], "absent.mp4"),

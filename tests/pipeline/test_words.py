@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from rmis_calib.pipeline.words import sentences
+from rmis_calib.pipeline.words import words_of
 from rmis_calib.solver import MotionReason
 from rmis_calib.vision import FrameReason
 
@@ -11,7 +11,7 @@ from rmis_calib.vision import FrameReason
 def test_each_motion_has_the_sentence_of_its_code() -> None:
     codes = torch.tensor([MotionReason.OUTLIER, MotionReason.USED, MotionReason.OUTLIER])
     words = ["does not fit the other motions", "used", "does not fit the other motions"]
-    assert sentences(list(MotionReason), codes).tolist() == words
+    assert words_of(codes, [reason.sentence for reason in MotionReason]).tolist() == words
 
 
 @pytest.mark.parametrize("kind", [MotionReason, FrameReason])
