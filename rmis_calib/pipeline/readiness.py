@@ -3,6 +3,7 @@
 A few frames are searched; the pose that they give predicts what all motions would tell.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -119,16 +120,22 @@ def _look(
     masks = open_masks(
         config.masks, {side: source for side, (source, _) in sources.items()}, config.device, config.mask_labels
     )
-    views, repeats = [], []
-    for side, (source, camera) in sources.items():
-        images = source.frames(few.frames.tolist()).to(config.device)
-        change = torch.full((source.count,), torch.inf)
-        change[torch.as_tensor(few.frames)] = ChangeMeter()(images).cpu()
-        is_looked = torch.as_tensor(np.isin(few.frames, looked))
-        found = _detections(images[is_looked], looked, camera, masks.get(side), config)
-        views.append(View(side, source, camera, over_all(found, source.count, torch.as_tensor(looked)), change))
-        frames = few.frames[repeated_motions(change, few)]
-        repeats += [about_repeats(side, frames)] if len(frames) else []
+    is_looked, index = torch.as_tensor(np.isin(few.frames, looked)), torch.as_tensor(looked)
+    views, repeats, jobs = [], [], {}
+    # The search of one camera's pictures goes on while the other's are decoded.
+    with ThreadPoolExecutor(len(sources), thread_name_prefix="rmis-check") as executor:
+        for side, (source, camera) in sources.items():
+            images = source.frames(few.frames.tolist()).to(config.device)
+            jobs[side] = (
+                executor.submit(_detections, images[is_looked], looked, camera, masks.get(side), config),
+                ChangeMeter()(images).cpu(),
+            )
+        for side, (source, camera) in sources.items():
+            found, change = jobs[side][0].result(), torch.full((source.count,), torch.inf)
+            change[torch.as_tensor(few.frames)] = jobs[side][1]
+            views.append(View(side, source, camera, over_all(found, source.count, index), change))
+            frames = few.frames[repeated_motions(change, few)]
+            repeats += [about_repeats(side, frames)] if len(frames) else []
     return looked, tuple(views), repeats
 
 
