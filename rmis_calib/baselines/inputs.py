@@ -11,7 +11,8 @@ from rmis_calib.baselines.result import Setup
 from rmis_calib.errors import InputError, InsufficientDataError, ShapeError
 from rmis_calib.geometry import rigid_inverse
 
-LEAST_POSES, MOST_POSES = 3, 2000
+LEAST_POSES, MOST_POSES = 3, 1000
+"""All pairs of poses count, so memory grows with their square: about 1 GB with covariance at the upper end."""
 _ORTHONORMAL_TOLERANCE = 1e-4
 """Largest entry of R^T R - I that is taken for rounding in a file; more is no rotation."""
 
@@ -26,7 +27,9 @@ def read_samples(
         raise ShapeError(where="hand_eye", expected=expected, found=f"{tuple(robot.shape)}, {tuple(board.shape)}")
     batch, n = robot.shape[:-3], robot.shape[-3]
     if not LEAST_POSES <= n <= MOST_POSES:
-        raise InsufficientDataError(where="hand_eye", expected=f"{LEAST_POSES} to {MOST_POSES} poses", found=n)
+        raise InsufficientDataError(
+            where="hand_eye", expected=f"{LEAST_POSES} to {MOST_POSES} poses (thin a long stream)", found=n
+        )
     if (camera_left_T_board is None) != (camera_left_T_camera is None):
         expected = "camera_left_T_board and camera_left_T_camera together"
         raise InputError(where="hand_eye", expected=expected, found="one of them")

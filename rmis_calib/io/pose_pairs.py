@@ -19,6 +19,8 @@ _TO_MM = {"m": 1000.0, "mm": 1.0}
 _COLUMNS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 _MOVEIT, _EASY = ("effector_wrt_world", "object_wrt_sensor"), ("robot", "tracking")
 _SETUPS = {"eye_in_hand": "eye_in_hand", "eye_on_base": "eye_to_hand"}
+MOST_PAIRS = 500
+"""Pairs that are kept of a longer stream."""
 _UNIT_TOLERANCE = 1e-2
 """Largest deviation of a quaternion's length, and of an entry of R^T R, that is taken for rounding in a file."""
 _PLAUSIBLE_MM = (3.0, 30_000.0)
@@ -74,6 +76,10 @@ def read_pose_pairs(
         raise InputError(where="POSES", expected=expected, found=f"{len(paths)}: {', '.join(map(str, paths))}")
     unit = unit or "m"
     pairs = [_in_mm(poses, unit, place) for poses, place in zip((robot, board), where, strict=True)]
+    if len(robot) > MOST_PAIRS:
+        chosen = np.linspace(0, len(robot) - 1, MOST_PAIRS).round().astype(int)
+        pairs = [poses[chosen] for poses in pairs]
+        notes.append(f"{MOST_PAIRS} of {len(robot)} pairs were used, evenly spaced: neighbours in a stream add little")
     return PosePairs(pairs[0], pairs[1], setup or "eye_in_hand", notes)
 
 

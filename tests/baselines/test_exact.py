@@ -113,7 +113,7 @@ def test_bad_input_is_named() -> None:
         (lambda: rc.baselines.hand_eye(A, C, "parc"), InputError, "expected one of tsai, park"),
         (lambda: rc.baselines.hand_eye(A, C, setup="in_hand"), InputError, "expected one of eye_in_hand"),
         (lambda: rc.baselines.hand_eye(A, C[:5]), ShapeError, "one shape"),
-        (lambda: rc.baselines.hand_eye(A[:2], C[:2]), InsufficientDataError, "3 to 2000 poses, found 2"),
+        (lambda: rc.baselines.hand_eye(A[:2], C[:2]), InsufficientDataError, "3 to 1000 poses .*, found 2"),
         (lambda: rc.baselines.hand_eye(mirrored, C), InputError, "base_T_flange: expected rotations"),
         (lambda: rc.baselines.hand_eye(gone, C), InputError, "base_T_flange: expected finite"),
         (lambda: rc.baselines.hand_eye(A, C, "rcm"), InputError, "base_p_rcm and board_p_rcm"),

@@ -146,3 +146,12 @@ def test_bad_files_are_named(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=words):
             read_pose_pairs(paths)
+
+
+def test_a_long_stream_is_thinned_and_says_so(tmp_path: Path) -> None:
+    times = np.arange(2000) * 0.03
+    robot = write_csv(tmp_path / "robot.csv", rows(np.tile(ROBOT, (400, 1, 1))[:2000], times))
+    board = write_csv(tmp_path / "board.csv", rows(np.tile(BOARD, (400, 1, 1))[:2000], times))
+    found = read_pose_pairs([robot, board])
+    assert len(found.base_T_flange) == len(found.camera_T_board) == 500
+    assert found.notes == ["500 of 2000 pairs were used, evenly spaced: neighbours in a stream add little"]
