@@ -16,6 +16,10 @@ from rmis_calib.studies.plots import BOUND_COLOUR, COLOURS, MARKERS, Figure, Pan
 _WIDTH_IN = 7.2
 """Both columns of a journal's page."""
 _PANEL_HEIGHT_IN = 1.9
+_LEGEND_LINE_IN = 0.16
+_APART = 0.09
+"""Points without a line that share their x stand side by side: the distance from one method to the next."""
+_MOST_TICKS = 12
 _FINE = 60.0
 """Axes that span less get numbers between the decades."""
 _DASHES = ("-", (0, (5, 2)), (0, (1, 1.5)), (0, (5, 2, 1, 2)))
@@ -56,7 +60,10 @@ def write_figure(folder: Path, figure: Figure, about: Mapping[str, str]) -> list
 def _draw(figure: Figure) -> MplFigure:
     rows, columns = len(figure.rows), max(len(row) for row in figure.rows)
     width = _WIDTH_IN if columns > 1 else 0.55 * _WIDTH_IN
-    drawn = MplFigure(figsize=(width, _PANEL_HEIGHT_IN * rows + 0.75), layout="constrained")
+    names = {series.name for row in figure.rows for panel in row for series in panel.series if series.style.is_named}
+    legend_columns = 3 if columns > 1 else 1
+    height = _PANEL_HEIGHT_IN * rows + 0.45 + _LEGEND_LINE_IN * (1 + len(names) // legend_columns)
+    drawn = MplFigure(figsize=(width, height), layout="constrained")
     panels = drawn.subplots(rows, columns, squeeze=False, sharey="row")
     for r, row in enumerate(figure.rows):
         for c in range(columns):
@@ -79,9 +86,7 @@ def _draw(figure: Figure) -> MplFigure:
     for axes in panels.flat:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
-    drawn.legend(
-        list(handles.values()), list(handles), loc="outside lower center", ncols=3 if columns > 1 else 1, frameon=False
-    )
+    drawn.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=legend_columns, frameon=False)
     return drawn
 
 
@@ -93,7 +98,7 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
         if series.style.is_bound:
             _draw_bound(axes, series)
         else:
-            _draw_method(axes, series)
+            _draw_method(axes, series, len(panel.series))
     if panel.y_line is not None:
         axes.axhline(panel.y_line[0], color="#5b5b5b", linewidth=0.8, linestyle=(0, (1, 2)), label=panel.y_line[1])
     axes.grid(axis="y", color="#d9d9d9", linewidth=0.5)
@@ -106,22 +111,28 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
         axes.set_xticks(ticks, [f"{x:g}" for x in ticks])
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.minorticks_off()
+    else:
+        values = sorted({x for series in panel.series for x in series.x})
+        if len(values) <= _MOST_TICKS and all(float(x).is_integer() for x in values):
+            axes.set_xticks(values)
 
 
 def _ticks(values: list[float]) -> list[float]:
     """Values far enough apart, on a log axis, for their numbers."""
     kept: list[float] = []
     span = np.log(values[-1] / values[0]) if len(values) > 1 else 1.0
-    for value in values:
-        if not kept or np.log(value / kept[-1]) > 0.17 * span:
+    for value in reversed(values):
+        if not kept or np.log(kept[-1] / value) > 0.17 * span:
             kept.append(value)
-    return kept
+    return kept[::-1]
 
 
-def _draw_method(axes: Axes, series: Series) -> None:
+def _draw_method(axes: Axes, series: Series, methods: int) -> None:
     place = series.style.index % len(COLOURS)
     shown = np.isfinite(series.middle)
     x, middle, low, high = (np.asarray(v)[shown] for v in (series.x, series.middle, series.low, series.high))
+    if series.style.is_named and not series.style.has_line:
+        x = x + _APART * (series.style.index - 0.5 * (methods - 1))
     colour = COLOURS[place]
     bars = np.stack([middle - low, np.where(np.isfinite(high), high, middle) - middle])
     axes.errorbar(

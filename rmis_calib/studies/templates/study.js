@@ -138,7 +138,8 @@
 
   figures.forEach((figure, k) => {
     const place = document.getElementById(`panels-${k}`);
-    place.style.gridTemplateColumns = `repeat(${Math.max(...figure.rows.map(row => row.length))}, minmax(15rem, 1fr))`;
+    const columns = Math.max(...figure.rows.map(row => row.length));  // a single column is laid out side by side
+    place.style.gridTemplateColumns = `repeat(${columns > 1 ? columns : "auto-fit"}, minmax(${columns > 1 ? 15 : 18}rem, 1fr))`;
     for (const row of figure.rows) for (const panel of row) draw(panel, rangeOf(row), place);
     legend(figure, document.getElementById(`legend-${k}`), place);
   });
