@@ -31,6 +31,8 @@ _MOVES = {"rad": 1e-4, "mm": 1e-6}
 have no offset that could be seen."""
 _STEP = {"rad": 1e-5, "mm": 1e-3}
 """Steps of the central differences: their error, step^2 times a third derivative of order 1, is below rounding."""
+_AT_ONCE = 16384
+"""Poses computed in one call: memory must not grow with a recording times its joints."""
 _CONTINUOUS_LOG_S = 0.2
 """A log sampled more slowly is a list of poses, in which there is no velocity and so no clock to estimate."""
 
@@ -190,6 +192,11 @@ class KinematicUnknowns(OffsetUnknowns):
         return MotionPoses(frames, arm_T_rcm, v, s_end, p_head), known[0]
 
     def _poses(self, readings: Float[Tensor, "*batch j"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        parts = [self._poses_at_once(part) for part in readings.flatten(0, -2).split(_AT_ONCE)]
+        T, v, s_end, p_head = (torch.cat(part).unflatten(0, readings.shape[:-1]) for part in zip(*parts, strict=True))
+        return T, v, s_end, p_head
+
+    def _poses_at_once(self, readings: Float[Tensor, "n j"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         instrument = self._kinematics.instrument(readings[..., self._split :])
         base_T_arm = self._kinematics.base_T_arm(readings[..., : self._split])
         arm_T_rcm = rigid_inverse(base_T_arm) @ instrument.base_T_rcm
@@ -207,19 +214,25 @@ class KinematicUnknowns(OffsetUnknowns):
         return self._times + clock_s.cpu().numpy()[:, None]
 
     def _jacobian(self, readings: Float[Tensor, "b m j"]) -> Float[Tensor, "b m 6 j"]:
-        """Displacement of the shaft as a rigid body, in `rcm`, per unit of each joint; all joints in one call."""
-        steps = torch.diag(self._steps)[:, None, None]
-        both = torch.stack([readings + steps, readings - steps])  # (2, j, b, m, j)
+        """Displacement of the shaft as a rigid body, in `rcm`, per unit of each joint."""
+        motions_at_once = max(1, _AT_ONCE // (2 * readings.shape[-1]))
+        parts = [self._jacobian_at_once(part) for part in readings.flatten(0, 1).split(motions_at_once)]
+        return torch.cat(parts).unflatten(0, readings.shape[:2])
+
+    def _jacobian_at_once(self, readings: Float[Tensor, "n j"]) -> Float[Tensor, "n 6 j"]:
+        """Central differences, all joints in one call."""
+        steps = torch.diag(self._steps)[:, None]
+        both = torch.stack([readings + steps, readings - steps])  # (2, j, n, j)
         arm_T_rcm, v, s_end, _ = self._poses(both)
         at_T, at_v, _, _ = self._poses(readings)
         arm_R_rcm = at_T[..., :3, :3]
-        change, scale = arm_T_rcm[0] - arm_T_rcm[1], 2.0 * self._steps[:, None, None, None]
+        change, scale = arm_T_rcm[0] - arm_T_rcm[1], 2.0 * self._steps[:, None, None]
         turn = arm_R_rcm.mT @ change[..., :3, :3]
         skew = 0.5 * (turn - turn.mT)
         omega = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1)
         omega = omega + torch.linalg.cross(at_v.expand_as(v[0]), v[0] - v[1])
         shift = (arm_R_rcm.mT @ change[..., :3, 3:])[..., 0] + at_v * (s_end[0] - s_end[1])[..., None]
-        return (torch.cat([omega, shift], dim=-1) / scale).permute(1, 2, 3, 0)
+        return (torch.cat([omega, shift], dim=-1) / scale).permute(1, 2, 0)
 
 
 class FileUnknowns(OffsetUnknowns):

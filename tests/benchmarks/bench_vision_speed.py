@@ -34,6 +34,15 @@ def opencv_chain(image: np.ndarray) -> np.ndarray | None:
     return cv2.HoughLinesP(cv2.bitwise_and(edges, cv2.dilate(mask, np.ones((5, 5), np.uint8))), 1, np.pi / 360, 80)
 
 
+def drawn_picture() -> np.ndarray:
+    """1280x720, a dark bar over rough tissue, (H, W, 3) uint8."""
+    rough = np.random.default_rng(0).normal(0.0, 25.0, (45, 80, 3)).astype(np.float32)
+    picture = cv2.resize(rough, (1280, 720), interpolation=cv2.INTER_CUBIC) + np.array([170.0, 95.0, 80.0])
+    cv2.line(picture, (1290, 120), (620, 430), (38.0, 36.0, 37.0), 74, cv2.LINE_AA)
+    picture = cv2.GaussianBlur(picture, (0, 0), 1.2)
+    return picture.clip(0, 255).astype(np.uint8)
+
+
 def timed(action: Callable[[], object], device: torch.device) -> tuple[float, float]:
     """Wall and processor seconds of one call, with the device's queue drained."""
     if device.type == "cuda":

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 import torch
 from bench_vision_render import run_preset
-from bench_vision_speed import opencv_chain
+from bench_vision_speed import drawn_picture, opencv_chain
 
 from data_synth import load_synth_config
 from rmis_calib.solver import SolverSettings, solve
@@ -118,20 +118,11 @@ def speed() -> list[Metric]:
         for method, seconds in zip(methods, ours, strict=True)
     ]
     metrics.append(Metric("time of joint, 20 trials of 216 motions", many / reference, unit, "lower", TIMES))
-    picture = rendered_picture()
+    picture = drawn_picture()
     images = torch.from_numpy(picture).permute(2, 0, 1)[None].repeat(4, 1, 1, 1)
     detector = ShaftDetector()
     theirs, ours = least_seconds(lambda: opencv_chain(picture), lambda: detector.detect(images))
     return [*metrics, Metric("time of detection, 1280x720", ours / 4 / theirs, "x OpenCV's chain", "lower", TIMES)]
-
-
-def rendered_picture() -> np.ndarray:
-    """1280x720, a dark bar over rough tissue, (H, W, 3) uint8."""
-    rough = np.random.default_rng(0).normal(0.0, 25.0, (45, 80, 3)).astype(np.float32)
-    picture = cv2.resize(rough, (1280, 720), interpolation=cv2.INTER_CUBIC) + np.array([170.0, 95.0, 80.0])
-    cv2.line(picture, (1290, 120), (620, 430), (38.0, 36.0, 37.0), 74, cv2.LINE_AA)
-    picture = cv2.GaussianBlur(picture, (0, 0), 1.2)
-    return picture.clip(0, 255).astype(np.uint8)
 
 
 def main() -> int:

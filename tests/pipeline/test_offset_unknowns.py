@@ -10,6 +10,7 @@ import rmis_calib as rc
 from rmis_calib.config import parse_config
 from rmis_calib.geometry.rigid import rigid_inverse
 from rmis_calib.geometry.rotations import matrix_to_rotvec
+from rmis_calib.pipeline import offset_unknowns
 from rmis_calib.pipeline.estimation import estimate_with_kinematics
 from rmis_calib.pipeline.offset_unknowns import KinematicUnknowns
 from rmis_calib.pipeline.poses import motion_poses
@@ -54,6 +55,19 @@ def test_derivative_is_the_displacement_of_the_shaft(moving):
         torch.testing.assert_close(
             here.joint_derivative[0, :, :, joint], expected, atol=1e-3 * float(expected.abs().max()), rtol=0.0
         )
+
+
+def test_parts_of_a_recording_give_the_same_as_the_whole(moving, monkeypatch):
+    recording = rc.load_recording(moving)
+    poses = motion_poses(recording)
+    unknowns = KinematicUnknowns(recording, poses.frames, "cpu")
+    zero, clock = torch.zeros(2, len(unknowns.columns), dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
+    derivative = unknowns.joint_derivative(zero, clock)
+    arm_T_rcm = unknowns.motion_poses(poses.frames, zero[0], 0.0)[0].arm_T_rcm
+    monkeypatch.setattr(offset_unknowns, "_AT_ONCE", 100)
+    torch.testing.assert_close(unknowns.joint_derivative(zero, clock), derivative, rtol=1e-9, atol=1e-9)
+    again = unknowns.motion_poses(poses.frames, zero[0], 0.0)[0].arm_T_rcm
+    torch.testing.assert_close(again, arm_T_rcm, rtol=1e-12, atol=1e-12)
 
 
 def test_motions_outside_of_the_log_are_not_known(moving):
