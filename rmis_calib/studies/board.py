@@ -43,9 +43,9 @@ def measure_board(world: World, count: int, generator: np.random.Generator) -> B
         InputError: the board is out of sight too often.
     """
     board, scene = Board(), world.scene
-    camera_T_board_home = rigid(rotation_from_rotvec(BOARD_ROTVEC), world.config.scene.target_mm)
-    camera_T_board_home = camera_T_board_home @ rigid(np.eye(3), -board.centre)
-    base_T_board = scene.base_T_camera_home @ camera_T_board_home
+    camera_home_T_centre = rigid(rotation_from_rotvec(BOARD_ROTVEC), world.config.scene.target_mm)
+    centre_T_board = rigid(np.eye(3), -board.centre)
+    base_T_board = scene.base_T_camera_home @ camera_home_T_centre @ centre_T_board
     renderers = {side: BoardRenderer(camera, board) for side, camera in world.cameras.items()}
     arms: list[Array] = []
     poses: dict[str, list[Array]] = {side: [] for side in renderers}
@@ -55,8 +55,8 @@ def measure_board(world: World, count: int, generator: np.random.Generator) -> B
         camera_right_T_board = scene.camera_right_T_arm @ rigid_inverse(base_T_arm) @ base_T_board
         measured = {}
         for side, renderer in renderers.items():
-            truth = world.camera_T_camera_right(side) @ camera_right_T_board
-            pose = _pose(renderer.draw(truth, generator), world.cameras[side], board)
+            camera_T_board = world.camera_T_camera_right(side) @ camera_right_T_board
+            pose = _pose(renderer.draw(camera_T_board, generator), world.cameras[side], board)
             if pose is None:
                 break
             measured[side] = pose

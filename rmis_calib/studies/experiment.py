@@ -158,9 +158,9 @@ def _board_rows(cell: Experiment, part: Part, measured: "Measured") -> Columns:
         found = baselines.hand_eye(
             base_T_arm, board["camera_right_T_board"][index], part.method, covariance=False, **second
         )
-        arm_T_camera = found.flange_T_camera
-        usable = torch.isfinite(arm_T_camera).flatten(-2).all(-1)
-        safe = torch.where(usable[..., None, None], arm_T_camera, torch.eye(4, dtype=arm_T_camera.dtype))
+        flange_T_camera = found.flange_T_camera  # the flange is `arm` here
+        usable = torch.isfinite(flange_T_camera).flatten(-2).all(-1)
+        safe = torch.where(usable[..., None, None], flange_T_camera, torch.eye(4, dtype=flange_T_camera.dtype))
         return torch.where(usable[..., None, None], torch.linalg.inv(safe), torch.nan)
 
     return _rows(cell, part, measured, BOARD, cell.board_motions, solve)
@@ -240,8 +240,11 @@ def head_errors_px(measured: "Measured", camera_right_T_arm: np.ndarray, cell: E
     generator = np.random.default_rng([cell.seed, cell.number, 0])
     lines, last = measured.lines, slice(-cell.pictures.validation, None)
     arm_T_rcm = np.broadcast_to(lines["arm_T_rcm"][last], (len(camera_right_T_arm), cell.pictures.validation, 4, 4))
-    camera_T_rcm = camera_right_T_arm[:, None] @ _logged(arm_T_rcm, cell.pictures, generator)
-    p = np.einsum("tnij,nj->tni", camera_T_rcm[..., :3, :3], lines["rcm_p_head"][last]) + camera_T_rcm[..., :3, 3]
+    camera_right_T_rcm = camera_right_T_arm[:, None] @ _logged(arm_T_rcm, cell.pictures, generator)
+    p = (
+        np.einsum("tnij,nj->tni", camera_right_T_rcm[..., :3, :3], lines["rcm_p_head"][last])
+        + camera_right_T_rcm[..., :3, 3]
+    )
     in_front = p[..., 2] > 1.0
     depth = np.where(in_front, p[..., 2], 1.0)
     xy = np.where(in_front[..., None], p[..., :2] / depth[..., None], np.inf)  # behind the camera: nowhere near
