@@ -18,7 +18,7 @@ from scipy.stats import chi2
 from rmis_calib.errors import InputError
 from rmis_calib.geometry.rigid import RigidTransform
 from rmis_calib.geometry.rotations import matrix_to_rotvec, rotvec_to_matrix
-from rmis_calib.results import CalibrationResult
+from rmis_calib.results import CalibrationResult, covariance_of
 
 SIGNIFICANT = 0.01
 """Probability of a disagreement by chance below which it is called one."""
@@ -213,8 +213,7 @@ def _combined(results: Sequence[CalibrationResult]) -> tuple[torch.Tensor, torch
                 beyond += sureness * _positive_part(covariance - told.transform_covariance())
             weight += sureness
         A[np.diag_indices(size)] += np.where(np.isfinite(priors), priors, np.inf) ** -2.0
-        root = np.diagonal(A) ** -0.5
-        covariance = np.linalg.inv(A * root[:, None] * root) * root[:, None] * root
+        covariance = covariance_of(A)
         step = torch.from_numpy(covariance @ b)
         R, t = rotvec_to_matrix(step[:3]) @ R, t + step[3:6]
     return R, t, covariance[:6, :6] + beyond / weight

@@ -4,6 +4,7 @@ from collections import Counter
 from typing import Annotated
 
 import numpy as np
+from jaxtyping import Float
 from pydantic import Field, computed_field, model_serializer, model_validator
 from pydantic.dataclasses import dataclass
 
@@ -154,8 +155,13 @@ class Information:
         """(6, 6) covariance of the transform that this and the priors give."""
         full = self.matrix.copy()
         full[np.diag_indices(len(full))] += np.concatenate([np.zeros(6), self.shared_prior_sigma**-2.0])
-        root = np.diagonal(full) ** -0.5
-        return (np.linalg.inv(full * root[:, None] * root) * root[:, None] * root)[:6, :6]
+        return covariance_of(full)[:6, :6]
+
+
+def covariance_of(information: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """Inverse of an information matrix, scaled to a unit diagonal: its units differ by many powers of ten."""
+    root = np.diagonal(information) ** -0.5
+    return np.linalg.inv(information * root[:, None] * root) * root[:, None] * root
 
 
 @dataclass(frozen=True)
