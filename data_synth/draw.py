@@ -198,7 +198,13 @@ def draw_instrument(picture: Tensor, brush: Brush, poses: InstrumentPoses, finis
         part_hit = hit_cylinder(near, cylinders, part.radius, brush.blur_px)
         beyond = _paint(beyond, brush, near, part_hit, cylinders.light, part, slide_px)
     colour[tip] = beyond
-    values[flat] = _paint(colour, brush, pixels, hit, cylinders.light, shaft, slide_px)
+    colour = _paint(colour, brush, pixels, hit, cylinders.light, shaft, slide_px)
+    for band in finish.bands:
+        s_from, s_to = (s_end.float() + s for s in (band.s_from_mm, band.s_to_mm))
+        part = _Part(band.ratio * poses.radius, band.surface, s_from, s_to)
+        band_hit = hit_cylinder(pixels, cylinders, part.radius, brush.blur_px)
+        colour = _paint(colour, brush, pixels, band_hit, cylinders.light, part, slide_px)
+    values[flat] = colour
 
 
 def _image(p: Tensor) -> Tensor:

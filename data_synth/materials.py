@@ -45,12 +45,23 @@ SHAFTS = {"dark_grey": DARK_GREY, "carbon": CARBON, "anodised": ANODISED, "slate
 
 
 @dataclass(frozen=True)
+class Band:
+    """A ring around an instrument: its radius over the shaft's, and where it lies, mm beyond the shaft's end."""
+
+    ratio: float
+    surface: Surface
+    s_from_mm: float
+    s_to_mm: float
+
+
+@dataclass(frozen=True)
 class Finish:
-    """Surfaces of one instrument from the shaft to the tip."""
+    """Surfaces of one instrument from the shaft to the tip, and rings around it."""
 
     shaft: Surface
     sleeve: Surface
     clevis: Surface
+    bands: tuple[Band, ...] = ()
 
 
 def own_finish(look: LookSettings) -> Finish:

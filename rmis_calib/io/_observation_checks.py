@@ -21,7 +21,10 @@ _SHAPES: dict[str, tuple[int, ...]] = {
     "rcm_p_head": (3,),
     **{f"{kind}_{side}": shape for kind, shape in _MEASURED.items() for side in _SIDES},
     **{f"sigma_{kind}_{side}": shape for kind, shape in _SIGMA.items() for side in _SIDES},
+    **{f"end_{what}_{side}": () for what in ("kind", "sureness") for side in _SIDES},
 }
+_END_KINDS = (0, 1)
+"""A tube's end and a ring."""
 _LEVELS = tuple(f"sigma_{what}_{unit}" for what in ("kinematics", "camera", "stereo") for unit in ("mm", "rad"))
 _INTRINSICS = ("sigma_focal", "sigma_centre", "sigma_lens")
 _SCALARS = ("shaft_radius_mm", "sigma_image", "sigma_edge_bias", *_INTRINSICS, *_LEVELS)
@@ -94,6 +97,9 @@ def _check_needs(given: Arrays) -> None:
                 _need(given, f"{kind}_{side}", _NEEDS[kind])
             if f"sigma_{kind}_{side}" in given:
                 _need(given, f"sigma_{kind}_{side}", f"{kind}_{side}")
+        for what in ("kind", "sureness"):
+            if f"end_{what}_{side}" in given:
+                _need(given, f"end_{what}_{side}", f"end_{side}")
     if has_left:
         _need(given, "a left array", "camera_left_T_camera_right")
     elif "valid_left" in given:
@@ -141,6 +147,10 @@ def _array(name: str, value: Any, n: int) -> np.ndarray:
             _check_sigma(name, float(np.nanmedian(array)))
         return array
     array[~_finite(array)] = np.nan
+    if name.startswith("end_kind"):
+        _refuse(name, ~np.isnan(array) & ~np.isin(array, _END_KINDS), "0 (tube) or 1 (ring)", lambda i: f"{array[i]:g}")
+    if name.startswith("end_sureness"):
+        _refuse(name, (array < 0) | (array > 1), "a probability", lambda i: f"{array[i]:g}")
     return array
 
 

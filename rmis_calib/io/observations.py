@@ -51,6 +51,14 @@ class ShaftObservations:
     """(N, 2): where the shaft ends, on its axis; needs `rcm_s_end_mm`."""
     end_left: np.ndarray | None = None
     """(N, 2)."""
+    end_kind_right: np.ndarray | None = None
+    """(N,): what the shaft ends at, 0 for the tube's own end, 1 for a ring that closes it; NaN where unknown."""
+    end_kind_left: np.ndarray | None = None
+    """(N,)."""
+    end_sureness_right: np.ndarray | None = None
+    """(N,): probability that it ends there, 0 to 1; NaN where that is unknown."""
+    end_sureness_left: np.ndarray | None = None
+    """(N,)."""
     rcm_s_end_mm: np.ndarray | None = None
     """(N,): nominal distance of the shaft's end from the RCM along the axis, known up to one constant."""
     head_right: np.ndarray | None = None

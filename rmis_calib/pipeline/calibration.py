@@ -12,6 +12,7 @@ from rmis_calib.geometry.rigid import RigidTransform
 from rmis_calib.io import Recording, ShaftObservations
 from rmis_calib.pipeline.advice import with_next_motions
 from rmis_calib.pipeline.association import Choice, associate, association_gate, consistent_choice, read_prior
+from rmis_calib.pipeline.background import about_background, without_background
 from rmis_calib.pipeline.detection import Progress, View, detect_recording, no_progress
 from rmis_calib.pipeline.device import require_device
 from rmis_calib.pipeline.estimation import estimate, raise_unless_trustworthy
@@ -25,6 +26,7 @@ from rmis_calib.pipeline.offsets import estimate_with_kinematics
 from rmis_calib.pipeline.poses import MotionPoses, motion_poses
 from rmis_calib.pipeline.result import insufficient_data, make_result, motions_of, residual_of, residuals_px
 from rmis_calib.pipeline.run import CalibrationRun
+from rmis_calib.pipeline.second_look import look_again
 from rmis_calib.results import CalibrationResult
 from rmis_calib.vision.masks import Segmenter
 
@@ -74,7 +76,8 @@ def run_calibration(
     prior = read_prior(config)
     poses = motion_poses(recording, config.device)
     views, notes = _detect(recording, config, poses, progress, segment)
-    return calibrate_views(recording, config, poses, views, prior, notes, progress)
+    searchable = segment is None and config.masks is None
+    return calibrate_views(recording, config, poses, views, prior, notes, progress, second_look=searchable)
 
 
 def calibrate_views(
@@ -85,6 +88,7 @@ def calibrate_views(
     prior: RigidTransform | None = None,
     notes: tuple[str, ...] = (),
     progress: Progress = no_progress,
+    second_look: bool = False,
 ) -> CalibrationRun:
     """The calibration from shafts that are detected already.
 
@@ -96,6 +100,7 @@ def calibrate_views(
         prior: from `read_prior`.
         notes: on what was detected.
         progress: called with (stage, done, total).
+        second_look: search pictures again in which a first answer expects a shaft and none that is sure was found.
     """
     attempts, several = associate(recording, config, poses, views, prior)
     checked = (*about_motions(recording, poses, config), *about_order(recording, poses, views, attempts[0]))
@@ -103,6 +108,8 @@ def calibrate_views(
     draft = _without_joint_offsets(config)
     run = solve_choices(recording, draft, views, poses, attempts, progress)
     run = _choose_again(run, draft, several, progress)
+    if second_look:
+        run = _look_again(run, draft, progress)
     run = _with_joint_offsets(run, config, progress)
     progress("checking", 0, 1)
     run = with_misfit_named(run, config, lambda: _with_cameras_as_given(run, config))
@@ -119,14 +126,18 @@ def _detect(
     progress: Progress,
     segment: Segmenter | None,
 ) -> tuple[tuple[View, ...], tuple[str, ...]]:
-    """The views without pictures that repeat the one before while the joints moved, and a note for each such view."""
+    """The views without pictures that repeat the one before while the joints moved, and without candidates that stand
+    still while the instrument moves; a note for each such view."""
     kept, notes = [], []
     for view in detect_recording(recording, config, progress, segment=segment):
         frames = poses.frames[repeated_motions(view.change, poses)]
         if len(frames):
             view = replace(view, detections=without_frames(view.detections, frames))
             notes.append(about_repeats(view.side, frames))
-        kept.append(view)
+        detections, count = without_background(view.detections, poses)
+        if count:
+            notes.append(about_background(view.side, count))
+        kept.append(replace(view, detections=detections))
     return tuple(kept), tuple(notes)
 
 
@@ -184,6 +195,17 @@ def _better_choices(run: CalibrationRun, several: bool) -> tuple[Choice, ...] | 
         reach = association_gate(choice, found, prediction, used) if several else torch.inf
         better.append(consistent_choice(found, prediction, reach))
     return tuple(better)
+
+
+def _look_again(run: CalibrationRun, config: CalibrationConfig, progress: Progress) -> CalibrationRun:
+    """The run with what a second look finds where the first answer expects it; as it was where that gains nothing."""
+    again = look_again(run, config, progress)
+    if again is None or all(new.same_as(old) for new, old in zip(again[1], run.choices, strict=True)):
+        return run
+    views, choices = again
+    better = _solve(run.recording, config, views, run.poses, choices, progress, run.clock_s)
+    told = better.result.status in ("ok", "weak")
+    return better if told and better.result.motions.used.sum() >= run.result.motions.used.sum() else run
 
 
 def _with_joint_offsets(run: CalibrationRun, config: CalibrationConfig, progress: Progress) -> CalibrationRun:

@@ -18,7 +18,7 @@ from rmis_calib.io import FrameBatch, FrameSource, Recording, load_recording, op
 from rmis_calib.pipeline.device import require_device
 from rmis_calib.pipeline.frozen import ChangeMeter
 from rmis_calib.pipeline.masks import MaskReader, open_masks
-from rmis_calib.vision import FrameReason, ShaftDetections, ShaftDetector
+from rmis_calib.vision import EndKind, FrameReason, ShaftDetections, ShaftDetector
 from rmis_calib.vision.masks import Segmenter
 
 Progress = Callable[[str, int, int], None]
@@ -260,7 +260,8 @@ def over_all(found: ShaftDetections, count: int, searched: slice | Tensor) -> Sh
     """Detections of the searched frames, as those of all `count` frames."""
     spread = {}
     for name, value in vars(found).items():
-        empty = torch.nan if value.is_floating_point() else int(FrameReason.LEFT_OUT) if name == "reason" else False
+        codes = {"reason": int(FrameReason.LEFT_OUT), "end_kind": int(EndKind.UNKNOWN)}
+        empty = torch.nan if value.is_floating_point() else codes.get(name, False)
         spread[name] = value.new_full((count, *value.shape[1:]), empty)
         spread[name][searched] = value
     return ShaftDetections(**spread)

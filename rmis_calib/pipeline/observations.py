@@ -110,6 +110,7 @@ def _measured(side: str, detections: ShaftDetections, choice: Choice, model_sigm
     axis = torch.where(turned[:, None, None], axis.flip(-2), axis)
     sigma = torch.where(turned[:, None], sigma.flip(-1), sigma)
     has_end = choice.taken & pick("end_valid") & ~turned
+    kind = pick("end_kind")
     return {
         f"axis_{side}": known(axis, choice.taken),
         f"sigma_axis_{side}": known(pick("axis_sigma").hypot(least / 2**0.5), choice.taken),
@@ -117,5 +118,7 @@ def _measured(side: str, detections: ShaftDetections, choice: Choice, model_sigm
         f"sigma_contour_{side}": known(sigma.hypot(least), choice.taken),
         f"end_{side}": known(pick("end_xy"), has_end),
         f"sigma_end_{side}": known(pick("end_sigma").hypot(least), has_end),
+        f"end_kind_{side}": known(kind.double(), has_end & (kind >= 0)),
+        f"end_sureness_{side}": known(pick("end_sureness"), has_end & (kind >= 0)),
         f"valid_{side}": choice.taken.cpu().numpy(),
     }

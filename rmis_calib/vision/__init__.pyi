@@ -1,3 +1,4 @@
+from .detections import EndKind as EndKind
 from .detections import FrameReason as FrameReason
 from .detections import ShaftDetections as ShaftDetections
 from .detector import ShaftDetector as ShaftDetector
@@ -8,3 +9,4 @@ from .draw.stage_sheet import draw_stage_sheet as draw_stage_sheet
 from .draw.stages import draw_stages as draw_stages
 from .masks import load_segmenter as load_segmenter
 from .settings import DetectorSettings as DetectorSettings
+from .straightness import StraightnessTable as StraightnessTable

@@ -25,6 +25,7 @@ class FrameReason(IntEnum):
     AMBIGUOUS = 7
     LEFT_OUT = 8
     REPEATED = 9
+    BACKGROUND = 10
 
     @property
     def sentence(self) -> str:
@@ -42,8 +43,23 @@ _SENTENCES = {
     FrameReason.EDGES_UNCLEAR: "too few sub-pixel edge points agree on two straight lines",
     FrameReason.AMBIGUOUS: "a strip was found, but its confidence is below the accepted minimum",
     FrameReason.LEFT_OUT: "the frame was left out: only every n-th was to be searched",
+    FrameReason.BACKGROUND: "what looked like a shaft stood still while the instrument moved",
     FrameReason.REPEATED: "the picture repeats the one before although the joints moved",
 }
+
+
+class EndKind(IntEnum):
+    """What a shaft ends at in the picture."""
+
+    UNKNOWN = -1
+    TUBE = 0
+    """Where the dark tube stops and something else begins, such as a metal wrist."""
+    RING = 1
+    """The near rim of a ring that closes the tube."""
+    BORDER = 2
+    """Nothing: it leaves the field of view."""
+    HIDDEN = 3
+    """Nothing: something else covers it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +86,11 @@ class ShaftDetections:
     end_sigma: Float[Tensor, "b k"]
     """Standard deviation along the axis."""
     end_valid: Bool[Tensor, "b k"]
+    """Whether the end is in view and was measured."""
+    end_kind: Int[Tensor, "b k"]
+    """`EndKind` of what is most probable."""
+    end_sureness: Float[Tensor, "b k"]
+    """Probability of that kind of end; of a tube's end or a ring, that it is near where it was measured."""
     direction_known: Bool[Tensor, "b k"]
     """Whether it is certain which side the tip is on."""
     confidence: Float[Tensor, "b k"]
@@ -79,6 +100,11 @@ class ShaftDetections:
     """The boundary as it was seen, raw pixels."""
     scatter_px: Float[Tensor, "b k 2"]
     """Robust standard deviation of one contour point about its line, px."""
+    straight_px: Float[Tensor, "b k 2 n"]
+    """Mean distance of the contour points of n stretches of each contour from its line, px, positive to the left of who
+    walks towards the tip; NaN where there are few."""
+    straight_uv: Float[Tensor, "b k 2 n 2"]
+    """Where these stretches lie, raw pixels."""
     blur_px: Float[Tensor, "b k 2"]
     """Standard deviation of the blur of each contour, px."""
 

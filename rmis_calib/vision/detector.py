@@ -13,7 +13,7 @@ from rmis_calib.geometry import Camera, axis_from_contours, plane_normal_from_po
 from rmis_calib.vision.coarse.search import SearchTrace, StripCandidates, search
 from rmis_calib.vision.coarse.strips import Strips
 from rmis_calib.vision.coarse.trace import Trace
-from rmis_calib.vision.detections import FrameReason, ShaftDetections, merge, needs_second_pass
+from rmis_calib.vision.detections import EndKind, FrameReason, ShaftDetections, merge, needs_second_pass
 from rmis_calib.vision.fine import confidence, edges, ends
 from rmis_calib.vision.image.canvas import Canvas, plan_canvas
 from rmis_calib.vision.image.line_fit import LineFit, fit_lines
@@ -24,6 +24,9 @@ from rmis_calib.vision.masks import checked_masks
 from rmis_calib.vision.settings import DetectorSettings
 
 _POLYLINE = 24
+_STRETCHES = 8
+_LEADS = 3
+"""Strips beyond the sure shafts that ask for a second look: the fourth best of an operating scene is tissue."""
 # Shading, blood and compression move points together over more than the blocks from which a line's uncertainty is
 # estimated: of factors from 1 to 2 this one makes the errors of the presets most likely.
 _LONG_ERRORS = 1.6
@@ -51,6 +54,22 @@ class ShaftDetector:
         self.segment = segment
         self._canvases: dict[tuple[tuple[int, int], torch.device], Canvas] = {}
 
+    def detect_near(self, images: Tensor, contours: Float[Tensor, "b 2 2 2"]) -> ShaftDetections:
+        """Shafts of each picture, looked for in both views, and where one is expected.
+
+        What lies there is measured and judged like everything else: an expectation adds candidates and no confidence.
+
+        Args:
+            images: as in `detect`.
+            contours: two points [edge, point, xy] of either contour of the expected shaft, both edges running the same
+                way; normalised undistorted coordinates. NaN for none.
+
+        Raises:
+            ShapeError: as in `detect`.
+        """
+        images, _, broken = self._prepared(images, None)
+        return self._look(images, None, broken, 2, self.lens.to_pixels(contours.to(torch.float32)))[0]
+
     def detect(self, images: Tensor, masks: Tensor | None = None) -> ShaftDetections:
         """Shafts of each picture.
 
@@ -69,7 +88,7 @@ class ShaftDetector:
         if twice == 1:
             return self._look(images, None, broken, 2)[0]
         found, stages = self._look(images, None, broken, 1)
-        again = needs_second_pass(found, stages.leads / images.shape[-1], twice)
+        again = needs_second_pass(found, stages.leads[:, :_LEADS] / images.shape[-1], twice)
         if not bool(again.any()):
             return found
         second, _ = self._look(images[again], None, broken[again], 2)
@@ -98,11 +117,16 @@ class ShaftDetector:
         return images, None if masks is None else checked_masks(masks, images), broken
 
     def _look(
-        self, images: Tensor, masks: Tensor | None, broken: Bool[Tensor, " b"], views: int
+        self,
+        images: Tensor,
+        masks: Tensor | None,
+        broken: Bool[Tensor, " b"],
+        views: int,
+        guesses: Float[Tensor, "b 2 2 2"] | None = None,
     ) -> tuple[ShaftDetections, SearchTrace]:
         """Search in one view or two, and sub-pixel measurement."""
         with torch.inference_mode():
-            found, stages = search(images, self._canvas(images), self.settings, views, masks)
+            found, stages = search(images, self._canvas(images), self.settings, views, masks, guesses)
             measured = self._measure(images, found, stages, broken)
         # Copied out of inference mode, whose tensors no gradient may be taken with respect to.
         return ShaftDetections(**{name: value.clone() for name, value in vars(measured).items()}), stages
@@ -138,8 +162,9 @@ class ShaftDetector:
         picture = FullPicture(decoded, found.frame, self.lens)
         points, fit = self._contours(picture, trace)
         strips = replace(trace.strips, offset=fit.offset, slope=fit.slope)
-        floor = 5 * self.settings.sigma_floor_px
-        end = ends.locate(picture, strips, trace.end, trace.width, points.blur_px.mean(-1), floor)
+        expected = ends.expect(found.verdict, trace)
+        floor, blur = 5 * self.settings.sigma_floor_px, points.blur_px.mean(-1)
+        end = ends.locate(picture, strips, expected.t, expected.reach_px, trace.width, blur, floor)
         offered = edges.at_stations(trace.sides, trace.t, points.t)
         share = (fit.inliers / offered.sum(-1).clamp(min=1)).amin(-1)
         reach = math.hypot(*images.shape[-2:])
@@ -149,7 +174,7 @@ class ShaftDetector:
         clear = cylinder & (share > 0.15) & ((scores > 0) & ~broken[:, None])[keep] & (fit.spread_t.amin(-1) > 0)
         plausible = confidence.plausible(trace, fit, share, reach)
         valid = clear & plausible & (certain >= self.settings.min_confidence)
-        measured = self._assemble(trace, strips, points, fit, end, valid, certain)
+        measured = self._assemble(trace, strips, points, fit, end, expected, valid, certain)
         reason = _reason(stages, scores, _spread(clear, keep), _spread(valid, keep), broken)
         fields = {name: _spread(value, keep) for name, value in measured.items()}
         return ShaftDetections(reason=reason, **fields).surest_first()
@@ -182,6 +207,7 @@ class ShaftDetector:
         points: edges.EdgePoints,
         fit: LineFit,
         end: ends.ShaftEnd,
+        expected: ends.ExpectedEnd,
         valid: Bool[Tensor, "b k"],
         certain: Float[Tensor, "b k"],
     ) -> dict[str, Tensor]:
@@ -197,9 +223,11 @@ class ShaftDetector:
         share = torch.linspace(0, 1, _POLYLINE, device=stop.device)
         t = trace.start[..., None] + (stop - trace.start)[..., None] * share
         polyline = strips.points(t[:, :, None].expand(-1, -1, 2, -1), strips.contour(t))
+        straight, t_block = points.bend(fit, _STRETCHES)
+        place = t_block[:, :, None].expand(-1, -1, 2, -1)
         sigma = ((_LONG_ERRORS * fit.sigma_px).square() + self.settings.sigma_floor_px**2).sqrt() / focal
         known = trace.start_at_border & ~trace.end_at_border
-        end_valid = end.valid & valid & ~trace.end_at_border
+        end_valid = end.valid & valid & expected.in_view
         return dict(
             valid=valid,
             contour_xy=_only(valid, contour),
@@ -209,11 +237,15 @@ class ShaftDetector:
             end_xy=_only(end_valid, end_xy),
             end_sigma=_only(end_valid, end.sigma_px / focal),
             end_valid=end_valid,
+            end_kind=torch.where(valid, expected.kind, int(EndKind.UNKNOWN)),
+            end_sureness=_only(valid, expected.sureness),
             direction_known=known & valid,
             confidence=_only(valid, certain),
             contour_uv=_only(valid, self.lens.to_raw(polyline)),
             end_uv=_only(end_valid, self.lens.to_raw(end_ideal)),
             scatter_px=_only(valid, fit.scatter_px),
+            straight_px=_only(valid, straight),
+            straight_uv=_only(valid, self.lens.to_raw(strips.points(place, strips.contour(t_block)))),
             blur_px=_only(valid, points.blur_px),
         )
 
@@ -222,8 +254,8 @@ class ShaftDetector:
 
 
 def _spread(listed: Tensor, keep: Bool[Tensor, "b k"]) -> Tensor:
-    """Values of listed strips, (1, m, ...), at their frames and ranks, (b, k, ...); false or NaN elsewhere."""
-    empty = False if listed.dtype == torch.bool else torch.nan
+    """Values of listed strips, (1, m, ...), at their frames and ranks, (b, k, ...); false, NaN or unknown elsewhere."""
+    empty = False if listed.dtype == torch.bool else torch.nan if listed.is_floating_point() else int(EndKind.UNKNOWN)
     dense = torch.full((*keep.shape, *listed.shape[2:]), empty, dtype=listed.dtype, device=listed.device)
     dense[keep] = listed[0]
     return dense

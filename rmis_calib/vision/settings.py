@@ -10,8 +10,9 @@ _STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 class DetectorSettings:
     """How shafts are looked for. The defaults serve every picture that the project was tested on."""
 
-    max_shafts: int = Field(default=3, ge=1, le=8)
-    """Most shafts reported a frame, best first."""
+    max_shafts: int = Field(default=6, ge=1, le=8)
+    """Most candidates measured and reported a frame, the surest first. Before a chessboard, or furniture, it takes many
+    for the shaft to be among them; what stands still while the instrument moves is left out by `calibrate`."""
     small_width_px: int = Field(default=320, ge=120, le=1280)
     """Width, px, of the small picture on which shafts are searched for; sub-pixel work is at full resolution."""
     min_width_fraction: float = Field(default=0.02, gt=0, lt=1)

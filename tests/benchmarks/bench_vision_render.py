@@ -304,6 +304,7 @@ def main() -> None:
     parser.add_argument("--presets", nargs="+", default=list(PRESETS))
     parser.add_argument("--keep", type=Path, help="folder for the recordings, used again by the next run")
     parser.add_argument("--no-barrel", action="store_true", help="leave out the comparison of lenses")
+    parser.add_argument("--no-peers", action="store_true", help="this detector alone")
     options = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
@@ -314,11 +315,11 @@ def main() -> None:
         folder = (options.keep or Path(temporary)) / str(options.frames)
         for preset in options.presets:
             config = replace(load_synth_config(preset), motions=options.frames)
-            tallies = run_preset(config, folder / preset)
+            tallies = run_preset(config, folder / preset, with_peers=not options.no_peers)
             ours[preset] = tallies["ours"]
             better = {name: times_better(ours[preset], t) for name, t in tallies.items() if name != "ours"}
             for name, tally in tallies.items():
-                print(tally.row(preset, name, better.get(name, min(better.values()))), flush=True)
+                print(tally.row(preset, name, better.get(name, min(better.values(), default=np.nan))), flush=True)
         print_confidence([grade for tally in ours.values() for grade in tally.graded])
         if not options.no_barrel:
             print_barrel(folder, options.frames)

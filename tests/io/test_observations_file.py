@@ -53,6 +53,8 @@ def everything() -> dict[str, Any]:
         arrays |= {f"{kind}_{side}": generator.normal(size=(N, *shape)) for kind, shape in shapes.items()}
         sigmas = {"axis": (), "contour": (2,), "end": (), "head": ()}
         arrays |= {f"sigma_{kind}_{side}": np.full((N, *shape), 1e-3) for kind, shape in sigmas.items()}
+        arrays[f"end_kind_{side}"] = np.arange(N) % 2
+        arrays[f"end_sureness_{side}"] = np.linspace(0.0, 1.0, N)
         arrays[f"valid_{side}"] = np.ones(N, dtype=bool)
     return arrays
 
@@ -246,6 +248,15 @@ BAD = {
     "ends alone": (drop("rcm_s_end_mm"), "end_right: expected rcm_s_end_mm beside it"),
     "heads alone": (drop("rcm_p_head"), "head_right: expected rcm_p_head beside it"),
     "left alone": (drop("camera_left_T_camera_right"), "a left array: expected camera_left_T_camera_right beside it"),
+    "another kind of end": (
+        put("end_kind_right", 2, 4),
+        r"end_kind_right\[2\]: expected 0 \(tube\) or 1 \(ring\), found 4",
+    ),
+    "sureness in per cent": (
+        put("end_sureness_left", 3, 80.0),
+        r"end_sureness_left\[3\]: expected a probability, found 80",
+    ),
+    "kind alone": (drop("end_left", "sigma_end_left"), "end_kind_left: expected end_left beside it"),
     "sigma alone": (drop("end_right"), "sigma_end_right: expected end_right beside it"),
     "flags alone": (drop(*(key for key in LEFT if key != "valid_left")), "valid_left: expected an array measured in"),
 }

@@ -65,11 +65,15 @@ def detections(candidates, direction_known):
         "end_xy": nan[..., None].expand(1, k, 2),
         "end_sigma": nan,
         "end_valid": torch.zeros(1, k, dtype=torch.bool),
+        "end_kind": torch.full((1, k), -1),
+        "end_sureness": nan,
         "direction_known": known,
         "confidence": torch.linspace(0.9, 0.5, k)[None],
         "contour_uv": nan[..., None, None, None].expand(1, k, 2, 4, 2),
         "end_uv": nan[..., None].expand(1, k, 2),
         "scatter_px": nan[..., None].expand(1, k, 2),
+        "straight_px": nan[..., None, None].expand(1, k, 2, 8),
+        "straight_uv": nan[..., None, None, None].expand(1, k, 2, 8, 2),
         "blur_px": nan[..., None].expand(1, k, 2),
     }
     return ShaftDetections(**{name: shapes[name] for name in ShaftDetections.__dataclass_fields__})

@@ -22,10 +22,16 @@ def shafts(*drawn: tuple[float, float, float]) -> ShaftDetections:
     """One frame, with room for three: upright shafts 40 px wide at x, with a confidence, turned by an angle in deg."""
     none = torch.zeros(1, 3, dtype=torch.bool)
     fields = {"valid": none.clone(), "end_valid": none, "direction_known": none}
-    fields |= {name: torch.full((1, 3), torch.nan) for name in ("axis_sigma", "end_sigma", "confidence")}
+    names = ("axis_sigma", "end_sigma", "end_sureness", "confidence")
+    fields |= {name: torch.full((1, 3), torch.nan) for name in names}
+    fields["end_kind"] = torch.full((1, 3), -1)
     pairs = ("contour_sigma", "end_xy", "end_uv", "scatter_px", "blur_px")
     fields |= {name: torch.full((1, 3, 2), torch.nan) for name in pairs}
     fields |= {"contour_xy": torch.full((1, 3, 2, 2, 2), torch.nan), "axis_xy": torch.full((1, 3, 2, 2), torch.nan)}
+    fields |= {
+        "straight_px": torch.full((1, 3, 2, 8), torch.nan),
+        "straight_uv": torch.full((1, 3, 2, 8, 2), torch.nan),
+    }
     fields["contour_uv"] = torch.full((1, 3, 2, 4, 2), torch.nan)
     for k, (x, confidence, angle_deg) in enumerate(drawn):
         angle = np.deg2rad(angle_deg)

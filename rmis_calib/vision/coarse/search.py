@@ -5,13 +5,17 @@ of the processor time of a picture of 1280 x 720 px, 26 with every eighth frame 
 enters would go unseen until then, for only what is spared would show it, and batches would have to wait for each other.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from rmis_calib.vision.coarse import appearance, hough, scoring, strips, trace
+from rmis_calib.vision.coarse.straight_pictures import straighten_pictures
+from rmis_calib.vision.coarse.strip_network import StripVerdict, load_network
 from rmis_calib.vision.image.canvas import Canvas, shrink
 from rmis_calib.vision.settings import DetectorSettings
 
@@ -25,6 +29,8 @@ _PART_OF_LIT, _SHADOWED = 0.6, (1.1, 1.6)
 _PART_MERIT = 0.5
 # A ridge below this is texture: 4 per cent of brightness a small pixel.
 _MIN_GRADIENT = 0.04
+# Where a shaft is looked for about the place at which it is expected: shares of its width across, rad.
+_AROUND = [(0.3 * i, 0.015 * j) for i in range(-2, 3) for j in range(-1, 2)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,10 +68,17 @@ class StripCandidates:
     """Which ranks of which frames are in the list; at least one."""
     scores: Float[Tensor, "b c"]
     """0 for none."""
+    verdict: StripVerdict
+    """Of the network on the kept ones, one list (m)."""
 
 
 def search(
-    images: Tensor, canvas: Canvas, settings: DetectorSettings, looks: int, masks: Tensor | None = None
+    images: Tensor,
+    canvas: Canvas,
+    settings: DetectorSettings,
+    looks: int,
+    masks: Tensor | None = None,
+    guesses: Float[Tensor, "b 2 2 2"] | None = None,
 ) -> tuple[StripCandidates, SearchTrace]:
     """The best strips of each frame, at most `max_shafts`, with their contours traced, and the stages that led there.
 
@@ -75,6 +88,8 @@ def search(
         settings: limits of width, contrast, convergence.
         looks: views of each picture that are searched, 1 or 2 (appearance.py); masks are a single one.
         masks: (b, H, W), 1 on shafts, which replace the colour stage.
+        guesses: two points of either contour of a shaft that is expected, ideal pixels; NaN for none. What lies there
+            is looked at beside what the search finds, and judged in the same way.
     """
     small = shrink(images, canvas.factor)
     field, within = appearance.field_of_view(small, settings.black_level, _RIM_PX)
@@ -99,9 +114,12 @@ def search(
     # Masks have no texture: a strip that is too wide looks as good at a glance as the right one, so none is left out.
     count_pairs = _STRIPS if masks is None else _PAIRS
     pairs = scoring.screen(picture, strips.pair(lines, picture, settings, _PAIRS), settings, count_pairs)
+    if guesses is not None:
+        pairs = pairs.together(_expected(guesses, canvas, count))
     evidence = scoring.inspect(picture, pairs, settings)
     scores = scoring.score(evidence, settings)
-    found = _best(picture, evidence, scores, settings, settings.max_shafts)
+    look = partial(_look_along, rgb, seen, picture)
+    found = _best(picture, evidence, scores, settings, look)
     ridge, votes = ridge.unflatten(0, (-1, count)).any(1), votes.unflatten(0, (-1, count)).amax(1)
     lines = hough.HoughLines(**{n: v.unflatten(0, (-1, count)).flatten(1, 2) for n, v in vars(lines).items()})
     evidence, scores = evidence.views_together(count), scores.unflatten(0, (-1, count)).flatten(1, 2)
@@ -109,17 +127,35 @@ def search(
     return found, SearchTrace(*pictures, lines, evidence, scores, found.scores, canvas.factor, canvas.origin)
 
 
+def _expected(guesses: Float[Tensor, "b 2 2 2"], canvas: Canvas, views: int) -> strips.Strips:
+    """Strips about the expected one, in each view of each picture."""
+    shift, turn = (torch.tensor(values, device=guesses.device) for values in zip(*_AROUND, strict=True))
+    centre = guesses.new_tensor(canvas.centre)
+    through = strips.Strips.through(guesses[:, None].repeat_interleave(views, 0), centre)
+    return through.around(shift.to(guesses.dtype), turn.to(guesses.dtype))
+
+
+def _look_along(
+    rgb: Float[Tensor, "n 3 h w"], seen: Bool[Tensor, "n h w"], picture: strips.SmallPicture, several: strips.Strips
+) -> StripVerdict:
+    """What the network says of strips in any of the views; places of ends as stations, px."""
+    number = several.frame // picture.views
+    straight, chord = straighten_pictures(rgb, seen.to(rgb.dtype), picture.canvas, several, number)
+    return load_network(rgb.device).judge(straight, chord.flatten(0, 1))
+
+
 def _best(
     picture: strips.SmallPicture,
     evidence: scoring.Evidence,
     scores: Float[Tensor, "v k"],
     settings: DetectorSettings,
-    wanted: int,
+    look: Callable[[strips.Strips], StripVerdict],
 ) -> StripCandidates:
     """The best strips of each view, traced; and of these the best of each picture, traced once more.
 
     A strip of one view that lies on one of another competes by how straight its contours are.
     """
+    wanted = settings.max_shafts
     index, best = scoring.distinct(evidence, scores, wanted)
     few = evidence.pick(index).views_together(picture.views)
     best = best.reshape(-1, picture.views * wanted)
@@ -143,7 +179,8 @@ def _best(
     chosen[0, 0] |= ~chosen.any()
     listed = straight.pick(place.gather(1, index)[chosen][None])
     # Once more around lines through what was traced: the pair of Hough lines may have followed a short stretch only.
-    return StripCandidates(trace.trace(picture, listed, settings), listed.frame // picture.views, chosen, best)
+    traced = trace.trace(picture, listed, settings)
+    return StripCandidates(traced, listed.frame // picture.views, chosen, best, look(traced.strips))
 
 
 def _lay_out(

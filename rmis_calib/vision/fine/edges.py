@@ -14,6 +14,7 @@ from torch.nn.functional import pad
 
 from rmis_calib.vision.coarse.strips import Strips
 from rmis_calib.vision.fine.subpixel import step_columns, step_estimator
+from rmis_calib.vision.image.line_fit import LineFit
 from rmis_calib.vision.image.run_length import masked_median
 from rmis_calib.vision.image.sampling import FullPicture
 
@@ -35,6 +36,20 @@ class EdgePoints:
     """Step across the contour along the separating colour, fraction of full scale."""
     blur_px: Float[Tensor, "b k 2"]
     """Standard deviation of the blur of the step."""
+
+    def bend(self, line: LineFit, stretches: int) -> tuple[Float[Tensor, "b k 2 n"], Float[Tensor, "b k n"]]:
+        """Mean distance from the line of the points of each of n stretches, and the stretches' stations.
+
+        Points that are astray do not count; NaN where fewer than a quarter of a stretch's points do.
+        """
+        size = self.t.shape[-1] // stretches
+        t = self.t[..., : size * stretches].unflatten(-1, (stretches, size))
+        off = self.lateral - line.offset[..., None] - line.slope[..., None] * self.t[:, :, None]
+        counts = self.valid & (off.abs() < 4 * line.scatter_px[..., None])
+        off, counts = (v[..., : size * stretches].unflatten(-1, (stretches, size)) for v in (off, counts))
+        number = counts.sum(-1)
+        mean = torch.where(counts, off, 0.0).sum(-1) / number.clamp(min=1)
+        return torch.where(number > size // 4, mean, torch.nan), t.mean(-1)
 
 
 def place_samples(on: Bool[Tensor, "b k s"], t: Float[Tensor, " s"], count: int) -> Float[Tensor, "b k p"]:

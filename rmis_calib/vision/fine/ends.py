@@ -3,10 +3,13 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from rmis_calib.vision.coarse.strip_network import StripVerdict
 from rmis_calib.vision.coarse.strips import Strips
+from rmis_calib.vision.coarse.trace import Trace
+from rmis_calib.vision.detections import EndKind
 from rmis_calib.vision.fine.subpixel import step_estimator
 from rmis_calib.vision.image.sampling import FullPicture
 
@@ -26,18 +29,69 @@ class ShaftEnd:
     valid: Bool[Tensor, "b k"]
 
 
+# Share of the width over which the end may lie where the network does not say: at a wrist the tone changes at once.
+_TRACED_REACH = 0.25
+# The network's own error, columns and share of the width.
+_COLUMNS, _WIDTH_SHARE = 1.0, 0.04
+# Least probability of the place that the network gives for it to be believed rather than the trace.
+_BELIEVED = 0.35
+
+
+@dataclass(frozen=True, eq=False)
+class ExpectedEnd:
+    """What is known of the end before it is measured."""
+
+    t: Float[Tensor, "1 m"]
+    """Station, px."""
+    reach_px: Float[Tensor, "1 m"]
+    """1 sigma of that."""
+    kind: Int[Tensor, "1 m"]
+    """`EndKind`."""
+    sureness: Float[Tensor, "1 m"]
+    in_view: Bool[Tensor, "1 m"]
+
+
+def expect(verdict: StripVerdict, trace: Trace) -> ExpectedEnd:
+    """Where the end should be: as the network sees it, or where it does not know, where the trace's own tone ends."""
+    at, kind, share = (value[None] for value in verdict.best_end())
+    border, hidden = verdict.border[None], verdict.hidden[None]
+    believed = (share > _BELIEVED) & (share > torch.maximum(border, hidden)) & (verdict.shaft[None] > 0)
+    outside = torch.maximum(border, hidden) > 0.5
+    unseen = torch.where(hidden > border, int(EndKind.HIDDEN), int(EndKind.BORDER))
+    unknown = torch.where(outside, unseen, int(EndKind.UNKNOWN))
+    column = verdict.column_px[None]
+    reach = torch.maximum(_COLUMNS * column, _WIDTH_SHARE * trace.width)
+    return ExpectedEnd(
+        t=torch.where(believed, at, trace.end),
+        reach_px=torch.where(believed, reach, _TRACED_REACH * trace.width),
+        kind=torch.where(believed, kind, unknown),
+        sureness=torch.where(believed, share, torch.where(outside, torch.maximum(border, hidden), 0.0)),
+        in_view=believed | (~outside & ~trace.end_at_border),
+    )
+
+
 def locate(
     picture: FullPicture,
     strips: Strips,
     coarse_t: Float[Tensor, "b k"],
+    reach_px: Float[Tensor, "b k"],
     width: Float[Tensor, "b k"],
     blur_px: Float[Tensor, "b k"],
     floor_px: float,
 ) -> ShaftEnd:
-    """First strong change of colour met when walking along the shaft towards the tip, near the coarse end.
+    """The change of colour along the shaft near the coarse end: a strong one, and a near one.
 
     The boundary is an arc of an ellipse in the picture: its place is measured on rows across the middle half of the
     width, and read on the axis from a parabola through them.
+
+    Args:
+        picture: at full resolution.
+        strips: through the measured contours, walked towards the tip.
+        coarse_t: where the end is, about.
+        reach_px: 1 sigma of that.
+        width: of the shaft.
+        blur_px: of its contours.
+        floor_px: least uncertainty.
     """
     step = (0.9 * width / _HALF).clamp(0.5, 3.0)
     offsets = torch.arange(-_HALF, _HALF + 1, device=width.device, dtype=width.dtype)
@@ -48,7 +102,7 @@ def locate(
     colours, seen = picture.read(strips.points(t[:, :, None].expand_as(y), y))
     seen = seen.all(2)
     profile = _separate(colours.movedim(0, -1), seen)
-    index, rise, found = _first_rise(_darker_rows(profile), seen)
+    index, rise, found = _near_rise(_darker_rows(profile), seen, reach_px / step)
     shift, agreement = _refine(profile, index, (blur_px / step).clamp(0.5, 3.0))
     place = index.to(t.dtype) - _HALF + shift
     sigma = (agreement * step).clamp(min=floor_px)
@@ -73,18 +127,18 @@ def _separate(colours: Float[Tensor, "b k r n 3"], seen: Bool[Tensor, "b k n"]) 
     return torch.einsum("bkrnc,bkc->bkrn", colours, main)
 
 
-def _first_rise(
-    profile: Float[Tensor, "b k n"], seen: Bool[Tensor, "b k n"]
+def _near_rise(
+    profile: Float[Tensor, "b k n"], seen: Bool[Tensor, "b k n"], reach: Float[Tensor, "b k"]
 ) -> tuple[Tensor, Float[Tensor, "b k"], Bool[Tensor, "b k"]]:
-    """Index where the profile first climbs half-way from the shaft's level to the level that follows; that climb."""
-    known = torch.where(seen, profile, torch.nan)
-    third = profile.shape[-1] // 3
-    base = torch.nan_to_num(known[..., :third].nanmedian(-1).values)
-    top = torch.nan_to_num(known[..., third:].nanquantile(0.8, dim=-1))
-    above = seen & (profile > (0.5 * (base + top))[..., None])
-    held = above[..., 2:] & above[..., 1:-1] & above[..., :-2]
-    index = held.to(torch.int8).argmax(-1).clamp(_FIT + 1, profile.shape[-1] - _FIT - 2)
-    return index, top - base, held.any(-1) & (seen.sum(-1) > 2 * third)
+    """Index of the steepest rise, steps farther off than `reach` samples from the middle counting less; its height."""
+    # Each sample against the one four before it, from two to either side.
+    slope = torch.zeros_like(profile)
+    slope[..., 2:-2] = profile[..., 4:] - profile[..., :-4]
+    offsets = torch.arange(-_HALF, _HALF + 1, device=profile.device)
+    weight = torch.exp(-0.5 * (offsets / reach[..., None].clamp(min=2.0)).square())
+    best = torch.where(seen, slope * weight, 0.0).argmax(-1, keepdim=True)
+    index = best[..., 0].clamp(_FIT + 1, profile.shape[-1] - _FIT - 2)
+    return index, slope.gather(-1, best)[..., 0], seen.sum(-1) > 2 * (profile.shape[-1] // 3)
 
 
 def _refine(

@@ -1,0 +1,74 @@
+"""Small straight pictures of strips, across by along: from where the axis enters the picture to where it leaves."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from rmis_calib.vision.coarse.strips import Strips
+from rmis_calib.vision.image.canvas import Canvas
+
+ACROSS, ALONG = 24, 128
+MARGIN = 1.0
+"""Reach from the middle line, widths: half a width beyond either contour."""
+CHANNELS = 6
+_FLOOR = 0.06
+"""Below this brightness, fraction of full scale, sensor noise is all there is."""
+
+
+def chord(strips: Strips, canvas: Canvas) -> Float[Tensor, "b k 2"]:
+    """Stations at which the middle line enters and leaves the canvas, px."""
+    height, width = canvas.size
+    low = strips.origin.new_tensor(canvas.origin)
+    high = low + canvas.factor * strips.origin.new_tensor([width - 1.0, height - 1.0])
+    along = torch.where(strips.along.abs() < 1e-6, 1e-6, strips.along)
+    a, b = (low - strips.origin) / along, (high - strips.origin) / along
+    return torch.stack([torch.minimum(a, b).amax(-1), torch.maximum(a, b).amin(-1)], -1)
+
+
+def straighten_pictures(
+    rgb: Float[Tensor, "n 3 h w"],
+    seen: Float[Tensor, "n h w"],
+    canvas: Canvas,
+    strips: Strips,
+    picture: Tensor,
+) -> tuple[Float[Tensor, "m 6 across along"], Float[Tensor, "b k 2"]]:
+    """One straight picture a strip, rows from left to right of the axis, columns along it; and the chord's stations.
+
+    Channels: log brightness of red, green, blue, less the picture's mean; whether the place is in the field of view;
+    the distance from the axis in half widths; how many columns a width is long (log, scaled), which tells a short thick
+    shaft from a long thin one.
+
+    Args:
+        rgb: the small picture.
+        seen: 1 in the field of view, else 0.
+        canvas: where the small picture lies.
+        strips: b * k = m of them.
+        picture: (b, k) int64, which picture each strip lies in.
+    """
+    ends = chord(strips, canvas)
+    share = torch.linspace(0, 1, ALONG, device=rgb.device)
+    t = ends[..., :1] + (ends[..., 1:] - ends[..., :1]) * share  # (b, k, along)
+    left, right = strips.contour(t).unbind(2)
+    middle, width = 0.5 * (left + right), (left - right).clamp(min=canvas.factor)
+    across = torch.linspace(MARGIN, -MARGIN, ACROSS, device=rgb.device)
+    y = middle[:, :, None] + width[:, :, None] * across[:, None]  # (b, k, across, along)
+    place = (strips.points(t[:, :, None].expand_as(y), y) - rgb.new_tensor(canvas.origin)) / canvas.factor
+    # The pictures lie below one another in a tall one, so that all strips are read in one call.
+    height, breadth = canvas.size
+    u, v = place.unbind(-1)
+    u, v = torch.nan_to_num(u), torch.nan_to_num(v)
+    inside = (u > -0.5) & (v > -0.5) & (u < breadth - 0.5) & (v < height - 0.5)
+    row = v.clamp(0, height - 1) + (picture * height)[..., None, None]
+    grid = torch.stack([u * (2.0 / (breadth - 1)) - 1, row * (2.0 / (len(rgb) * height - 1)) - 1], -1)
+    layers = torch.cat([rgb, seen[:, None]], 1).movedim(0, 1).reshape(1, 4, -1, breadth)
+    read = grid_sample(layers, grid.flatten(0, 2)[None], mode="bilinear", padding_mode="border", align_corners=True)
+    read = read.reshape(4, -1, ACROSS, ALONG)
+    known = (inside.reshape(-1, ACROSS, ALONG) & (read[3] > 0.75)).to(rgb.dtype)
+    colour = (read[:3] + _FLOOR).log()
+    mean = (colour * known).sum((0, 2, 3)) / (3 * known.sum((1, 2))).clamp(min=1.0)
+    colour = (colour - mean[:, None, None]) * known
+    columns = width.mean(-1) * (ALONG - 1) / (ends[..., 1] - ends[..., 0]).clamp(min=1.0)
+    aspect = 0.5 * columns.clamp(0.5, 200.0).log2().reshape(-1, 1, 1) - 1.5
+    constant = [2 * across.abs()[:, None].expand(len(mean), -1, ALONG), aspect.expand(-1, ACROSS, ALONG)]
+    return torch.stack([*colour, known, *constant], 1), ends
