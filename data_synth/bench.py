@@ -120,9 +120,10 @@ def _pose(generator: np.random.Generator, height: int, width: int, focal: float)
     wrist = generator.uniform(3.0, 16.0)
     side = np.cross(v, generator.normal(size=3))
     side /= np.linalg.norm(side)
-    tensors = [torch.as_tensor(a, dtype=torch.float64)[None, None] for a in (head - 40.0 * v, v, side)]
+    p_axis, v_axis, sideways = (torch.as_tensor(a, dtype=torch.float64)[None, None] for a in (head - 40.0 * v, v, side))
     s_end, s_head = (torch.tensor([[s]], dtype=torch.float64) for s in (40.0 - wrist, 40.0))
-    return InstrumentPoses(*tensors, s_end, s_head, radius=RADIUS_MM, wrist_ratio=generator.uniform(0.8, 1.0))
+    ratio = generator.uniform(0.8, 1.0)
+    return InstrumentPoses(p_axis, v_axis, sideways, s_end, s_head, radius=RADIUS_MM, wrist_ratio=ratio)
 
 
 def _finish(generator: np.random.Generator) -> Finish:

@@ -177,6 +177,8 @@ def _glove(generator: np.random.Generator, picture: Array) -> None:
     for turn in np.linspace(-0.5, 0.5, 4):
         reach = generator.uniform(0.15, 0.35) * width
         tip = root + reach * np.array([np.cos(angle + turn), np.sin(angle + turn)])
-        ends = [tuple(int(c) for c in np.round(p)) for p in (root, tip)]
+        start, end = ([int(c) for c in np.round(p)] for p in (root, tip))
         thick = int(0.07 * width)
-        cv2.line(picture, *ends, [float(c) for c in np.clip(colour * generator.uniform(0.85, 1.1), 0, 1)], thick, 16)
+        cv2.line(
+            picture, start, end, [float(c) for c in np.clip(colour * generator.uniform(0.85, 1.1), 0, 1)], thick, 16
+        )

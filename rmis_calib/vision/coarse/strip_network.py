@@ -98,7 +98,7 @@ class StripNetwork(nn.Module):
 def load_network(device: torch.device) -> StripNetwork:
     """The trained network, its weights in half precision in the package."""
     network = StripNetwork()
-    with (files(__package__) / _WEIGHTS).open("rb") as file, np.load(file) as weights:
+    with (files("rmis_calib.vision.coarse") / _WEIGHTS).open("rb") as file, np.load(file) as weights:
         network.load_state_dict({name: torch.from_numpy(weights[name].astype(np.float32)) for name in weights.files})
     return network.eval().requires_grad_(False).to(device)
 
