@@ -75,7 +75,7 @@ def test_swapped_cameras_are_noticed(demo_output):
 def static_observations(tmp_path_factory):
     """Detections of a rendered recording whose laparoscope stands still."""
     path = tmp_path_factory.mktemp("static") / "recording"
-    config = {"motions": 40, "seed": 11, "motion": {"laparoscope": "static"}}
+    config = {"motions": 60, "seed": 11, "motion": {"laparoscope": "static"}}
     data_synth.write_recording(path, data_synth.load_synth_config(config))
     run = rc.run_calibration(rc.load_recording(path))
     return path, run.result, run.observations

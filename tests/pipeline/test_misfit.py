@@ -113,7 +113,7 @@ def test_swapped_cameras_are_called_swapped(smooth, tmp_path) -> None:
     (folder / "right").rename(folder / "other")
     (folder / "left").rename(folder / "right")
     (folder / "other").rename(folder / "left")
-    result = calibrated(folder, joint_offsets="never")
+    result = calibrated(folder)
     assert not result.trustworthy
     assert result.message.partition("Likely: ")[2].startswith("the left and the right pictures look swapped")
 
@@ -136,7 +136,7 @@ def test_frozen_pictures_are_left_out_and_said(smooth, tmp_path) -> None:
         files = sorted((folder / side).iterdir())
         for number in range(16, 34):
             shutil.copy(files[15], files[number])
-    result = calibrated(folder, joint_offsets="never")
+    result = calibrated(folder)
     reason = "the picture repeats the one before although the joints moved"
     frozen = [i for i, why in enumerate(result.motions.reasons) if why == reason]
     assert set(range(19, 34)) <= set(frozen) <= set(range(16, 34))
@@ -151,5 +151,5 @@ def test_arms_at_rest_may_show_the_same_picture_again(smooth, tmp_path) -> None:
         files = sorted((folder / side).iterdir())
         for path in files[1:]:
             shutil.copy(files[0], path)
-    result = calibrated(folder, joint_offsets="never")
+    result = calibrated(folder)
     assert not any("repeat" in note for note in result.notes)
