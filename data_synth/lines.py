@@ -61,6 +61,12 @@ def simulate_lines(
         "camera_left_T_camera_right": stereo @ noise((trials,), "stereo"),
         "shaft_radius_mm": scene.shaft_radius_mm,
     }
+    laparoscope_T_base = rigid_inverse(scene.laparoscope.base_T_arm_base)
+    base_T_camera = poses.base_T_arm @ rigid_inverse(scene.camera_right_T_arm)
+    chain = laparoscope_T_base @ base_T_camera @ camera_right_T_arm
+    out["laparoscope_base_T_arm"] = np.broadcast_to(chain, (trials, n, 4, 4)).copy()
+    setup = laparoscope_T_base @ scene.instrument.base_T_arm_base
+    out["laparoscope_base_T_instrument_base"] = np.broadcast_to(setup, (trials, 4, 4)).copy()
     out |= _sigmas(config)
     out |= _measure(config, scene, seen_right, poses, generator, "right")
     out |= _measure(config, scene, seen_left, poses, generator, "left")

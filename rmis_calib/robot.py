@@ -60,8 +60,8 @@ class HeadPoint:
 class Arm:
     """One arm: where its base stands, its joints and, for an instrument, where its RCM, shaft and head are."""
 
-    base_T_arm_base: Float[np.ndarray, "4 4"]
-    """Pose of the arm's base, mm."""
+    base_T_arm_base: Float[np.ndarray, "4 4"] | None
+    """Pose of the arm's base, mm; None where nobody knows it: the calibration then finds the arms' bases too."""
     joints: tuple[Joint, ...]
     """From the base to the end."""
     end_T_tool: Float[np.ndarray, "4 4"]

@@ -11,7 +11,8 @@ from rmis_calib.exports.hand_eye import in_metres, rigid_inverse
 from rmis_calib.geometry.cameras import StereoRig
 from rmis_calib.io import Recording
 from rmis_calib.kinematics import RobotKinematics
-from rmis_calib.results import CalibrationResult
+from rmis_calib.results import CalibrationResult, KinematicOffsets
+from rmis_calib.robot import Robot
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +49,7 @@ def placement(recording: Recording, result: CalibrationResult, frame: int | None
         InputError: the recording has no such frame, or its joints are not known.
     """
     offsets = result.kinematic_offsets
-    arm, instrument = recording.laparoscope_arm, recording.instrument_arm
+    arm, instrument = None if offsets.arm_is_instrument_base else recording.laparoscope_arm, recording.instrument_arm
     columns = () if arm is None else recording.robot.columns(arm)
     times_s = recording.frame_times_s + recording.clock_offset_s + offsets.clock_s
     readings, known = recording.joints.select(columns).at(times_s) if columns else (np.empty((len(times_s), 0)), None)
@@ -63,15 +64,29 @@ def placement(recording: Recording, result: CalibrationResult, frame: int | None
         kinematics = RobotKinematics(recording.robot, arm, instrument)
         offset = np.array([offsets.joints.get(column, 0.0) for column in columns])
         base_T_arm = in_metres(kinematics.base_T_arm(torch.as_tensor(readings[frame] + offset)).numpy())
-    arms = recording.robot.arms
+    base_T_laparoscope_base, base_T_instrument_base = _bases(recording.robot, arm, instrument, offsets)
     return Placement(
         frame=frame,
         base_T_arm=base_T_arm,
-        base_T_laparoscope_base=None if arm is None else in_metres(np.asarray(arms[arm].base_T_arm_base)),
-        base_T_instrument_base=in_metres(np.asarray(arms[instrument].base_T_arm_base)),
+        base_T_laparoscope_base=None if base_T_laparoscope_base is None else in_metres(base_T_laparoscope_base),
+        base_T_instrument_base=in_metres(base_T_instrument_base),
         stereo=_as_corrected(recording.stereo, result),
         clock_offset_s=recording.clock_offset_s,
     )
+
+
+def _bases(
+    robot: Robot, arm: str | None, instrument: str, offsets: KinematicOffsets
+) -> tuple[Float[np.ndarray, "4 4"] | None, Float[np.ndarray, "4 4"]]:
+    """Both arms' bases, mm: as stated, but the instrument's where the calibration found it; `base` is the laparoscope's
+    arm's own, or the instrument's where there is none, where nobody states them."""
+    stated = [None if name is None else robot.arms[name].base_T_arm_base for name in (arm, instrument)]
+    if offsets.arm_is_instrument_base or (arm is not None and any(base is None for base in stated)):
+        stated = [None, None]
+    of_arm, of_instrument = (np.eye(4) if base is None else np.asarray(base) for base in stated)
+    if arm is None:
+        return None, of_instrument
+    return of_arm, of_instrument if offsets.setup is None else of_arm @ offsets.setup.matrix.numpy()
 
 
 def _as_corrected(stereo: StereoRig, result: CalibrationResult) -> StereoRig:

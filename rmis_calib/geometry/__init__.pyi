@@ -38,6 +38,9 @@ from .rigid import (
     rigid_inverse as rigid_inverse,
 )
 from .rigid import (
+    rigid_log as rigid_log,
+)
+from .rigid import (
     rotate_vectors as rotate_vectors,
 )
 from .rigid import (

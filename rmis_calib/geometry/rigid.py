@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rmis_calib.errors import FrameMismatchError, InputError, ShapeError
-from rmis_calib.geometry.rotations import matrix_to_quat, quat_to_matrix, rotvec_to_matrix
+from rmis_calib.geometry.rotations import matrix_to_quat, matrix_to_rotvec, quat_to_matrix, rotvec_to_matrix
 
 # An entry of R^T R may differ from the identity by this much: far above the rounding of printed matrices with seven
 # digits, far below any error that a wrong matrix has. Single precision cannot hold it, so there it is a few tens of
@@ -59,6 +59,11 @@ def rigid_exp(xi: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
     Source: DESIGN.md, section 3, "(exp(c deg eps), c mm eps)".
     """
     return rigid_from_rotation_translation(rotvec_to_matrix(xi[..., :3]), xi[..., 3:])
+
+
+def rigid_log(a_T_b: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 6"]:
+    """Rotation vector in rad, then translation in mm: the inverse of `rigid_exp`."""
+    return torch.cat((matrix_to_rotvec(a_T_b[..., :3, :3]), a_T_b[..., :3, 3]), dim=-1)
 
 
 @dataclass(frozen=True, eq=False)

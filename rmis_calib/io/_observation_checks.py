@@ -19,6 +19,7 @@ _SHAPES: dict[str, tuple[int, ...]] = {
     "rcm_v_axis": (3,),
     "rcm_s_end_mm": (),
     "rcm_p_head": (3,),
+    "laparoscope_base_T_arm": (4, 4),
     **{f"{kind}_{side}": shape for kind, shape in _MEASURED.items() for side in _SIDES},
     **{f"sigma_{kind}_{side}": shape for kind, shape in _SIGMA.items() for side in _SIDES},
     **{f"end_{what}_{side}": () for what in ("kind", "sureness") for side in _SIDES},
@@ -27,7 +28,8 @@ _END_KINDS = (0, 1)
 """A tube's end and a ring."""
 _LEVELS = tuple(f"sigma_{what}_{unit}" for what in ("kinematics", "camera", "stereo") for unit in ("mm", "rad"))
 _INTRINSICS = ("sigma_focal", "sigma_centre", "sigma_lens")
-_SCALARS = ("shaft_radius_mm", "sigma_image", "sigma_edge_bias", *_INTRINSICS, *_LEVELS)
+_SETUP = ("sigma_setup_mm", "sigma_setup_rad")
+_SCALARS = ("shaft_radius_mm", "sigma_image", "sigma_edge_bias", *_INTRINSICS, *_LEVELS, *_SETUP)
 _NEEDS = {"contour": "shaft_radius_mm", "end": "rcm_s_end_mm", "head": "rcm_p_head"}
 # Rounding of single precision stays below; a direction that was never normalised does not.
 _UNIT_TOLERANCE = 1e-6
@@ -36,6 +38,8 @@ _MAX_MEDIAN_COORDINATE = 10.0
 _RADIUS_MM = (0.5, 15.0)
 # No detector is off by a twentieth of the focal length (50 px at 1000), and no robot by 4.6 degrees a motion.
 _MAX_SIGMA_IMAGE, _MAX_SIGMA_RAD = 0.05, 0.08
+_MAX_SETUP_RAD = 1.0
+"""Of a set-up that is hardly known."""
 UNKNOWNS = ("unknown_names", "unknown_displacement", "unknown_at")
 CLOCK = "clock_s"
 """Name of the clock offset among `unknown_names`."""
@@ -56,8 +60,12 @@ def canonical(given: Arrays) -> Arrays:
     arrays = {name: _array(name, given[name], n) for name in _SHAPES if name in given}
     scalars = {name: _scalar(name, given[name]) for name in _SCALARS if name in given}
     if "camera_left_T_camera_right" in given:
-        arrays["camera_left_T_camera_right"] = _extrinsics(given["camera_left_T_camera_right"])
+        arrays["camera_left_T_camera_right"] = _extrinsics(given)
     known = _finite(arrays["arm_T_rcm"]) & _finite(arrays["rcm_v_axis"])
+    if "laparoscope_base_T_arm" in arrays:
+        known &= _finite(arrays["laparoscope_base_T_arm"])
+    if "laparoscope_base_T_instrument_base" in given:
+        arrays["laparoscope_base_T_instrument_base"] = _pose(given, "laparoscope_base_T_instrument_base")
     for side in _SIDES:
         if side == "right" or any(f"{kind}_{side}" in arrays for kind in _MEASURED):
             valid = _flags(f"valid_{side}", given.get(f"valid_{side}"), n) & known
@@ -100,6 +108,9 @@ def _check_needs(given: Arrays) -> None:
         for what in ("kind", "sureness"):
             if f"end_{what}_{side}" in given:
                 _need(given, f"end_{what}_{side}", f"end_{side}")
+    for name in ("laparoscope_base_T_instrument_base", *_SETUP):
+        if name in given:
+            _need(given, name, "laparoscope_base_T_arm")
     if has_left:
         _need(given, "a left array", "camera_left_T_camera_right")
     elif "valid_left" in given:
@@ -156,8 +167,9 @@ def _array(name: str, value: Any, n: int) -> np.ndarray:
 
 def _check_sigma(name: str, sigma: float) -> None:
     """Refuse a sigma whose size says that it is in pixels or degrees."""
-    if name.endswith("_rad") and sigma > _MAX_SIGMA_RAD:
-        hint, expected = "looks like degrees; multiply by pi / 180", f"at most {_MAX_SIGMA_RAD} rad"
+    most_rad = _MAX_SETUP_RAD if name in _SETUP else _MAX_SIGMA_RAD
+    if name.endswith("_rad") and sigma > most_rad:
+        hint, expected = "looks like degrees; multiply by pi / 180", f"at most {most_rad} rad"
     elif not name.endswith(("_rad", "_mm", "_focal", "_lens")) and sigma > _MAX_SIGMA_IMAGE:
         hint, expected = "looks like pixels; divide by the focal length", f"at most {_MAX_SIGMA_IMAGE} focal lengths"
     else:
@@ -184,13 +196,19 @@ def _scalar(name: str, value: Any) -> float:
     return number
 
 
-def _extrinsics(value: Any) -> np.ndarray:
-    name = "camera_left_T_camera_right"
-    array = _numbers(name, value)
+def _pose(given: Arrays, name: str) -> np.ndarray:
+    """One rigid transform."""
+    array = _numbers(name, given[name])
     if array.shape != (4, 4) or np.isnan(array).any():
         found = array.shape if array.shape != (4, 4) else "NaN"
         raise ObservationsError(where=name, expected="16 finite numbers of shape (4, 4)", found=found)
     check_rigid(array, name, ObservationsError)
+    return array
+
+
+def _extrinsics(given: Arrays) -> np.ndarray:
+    name = "camera_left_T_camera_right"
+    array = _pose(given, name)
     baseline_mm = float(np.linalg.norm(array[:3, 3]))
     if 0 < baseline_mm < 0.1:
         raise ObservationsError(METRES, where=name, expected="a baseline in mm", found=f"{baseline_mm:g}")
@@ -261,8 +279,10 @@ def _mask_side(arrays: Arrays, side: str, valid: np.ndarray) -> np.ndarray:
 
 def _check_kinematics(arrays: Arrays) -> None:
     T, v = arrays["arm_T_rcm"], arrays["rcm_v_axis"]
-    known = np.flatnonzero(_finite(T))
-    check_rigid(T[known], "arm_T_rcm", ObservationsError, known)
+    for name in ("arm_T_rcm", "laparoscope_base_T_arm"):
+        if name in arrays:
+            known = np.flatnonzero(_finite(arrays[name]))
+            check_rigid(arrays[name][known], name, ObservationsError, known)
     norm = np.linalg.norm(v, axis=1)
     _refuse("rcm_v_axis", np.abs(norm - 1) > _UNIT_TOLERANCE, "a unit vector", lambda i: f"length {norm[i]:.6g}")
     lengths = {"arm_T_rcm": T[:, :3, 3]} | {key: arrays[key] for key in ("rcm_p_head", "rcm_s_end_mm") if key in arrays}

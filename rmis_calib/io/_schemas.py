@@ -174,7 +174,7 @@ class HeadPointSchema(Schema):
 
 
 class ArmSchema(Schema):
-    base_T_arm_base: Matrix
+    base_T_arm_base: Matrix | None = None
     joints: Annotated[list[JointSchema], Field(min_length=1)]
     end_T_tool: Matrix | None = None
     rcm_frame: Annotated[int, Field(ge=0)] | None = None

@@ -76,6 +76,12 @@ class ShaftObservations:
     translation v ds."""
     unknown_at: np.ndarray | None = None
     """(U,) offsets at which the kinematics in this file were evaluated."""
+    laparoscope_base_T_arm: np.ndarray | None = None
+    """(N, 4, 4), mm: forward kinematics of the laparoscope's arm in its own base. With it the set-up, the pose of the
+    instrument's base in the laparoscope's, can be an unknown."""
+    laparoscope_base_T_instrument_base: np.ndarray | None = None
+    """(4, 4), mm: the set-up that `arm_T_rcm` was evaluated at, where somebody states it. Absent beside
+    `laparoscope_base_T_arm`: unknown; `arm_T_rcm` is then evaluated at the identity."""
     valid_right: np.ndarray | None = None
     """(N,) bool; after construction always an array."""
     valid_left: np.ndarray | None = None
@@ -100,6 +106,9 @@ class ShaftObservations:
     """Of each camera's principal point, per axis, in focal lengths."""
     sigma_lens: float | None = None
     """Of each camera's radial distortion k1."""
+    sigma_setup_mm: float | None = None
+    """Of the stated set-up, per axis, right perturbation; None: as the settings of the solver say."""
+    sigma_setup_rad: float | None = None
     sigma_axis_right: np.ndarray | None = None
     """(N,): one sigma of both points across the line, normalised units; NaN: `sigma_image`. The others likewise."""
     sigma_axis_left: np.ndarray | None = None

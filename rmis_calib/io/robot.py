@@ -58,7 +58,9 @@ def _arm_to_dict(arm: Arm) -> dict:
 
 
 def _arm(schema: ArmSchema, where: str, note: Note) -> Arm:
-    base_T_arm_base = rigid_from_text(schema.base_T_arm_base, f"{where}.base_T_arm_base", RobotError, note)
+    base_T_arm_base = None
+    if schema.base_T_arm_base is not None:
+        base_T_arm_base = rigid_from_text(schema.base_T_arm_base, f"{where}.base_T_arm_base", RobotError, note)
     end_T_tool = np.eye(4)
     if schema.end_T_tool is not None:
         end_T_tool = rigid_from_text(schema.end_T_tool, f"{where}.end_T_tool", RobotError, note)

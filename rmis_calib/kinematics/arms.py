@@ -59,8 +59,13 @@ class RobotKinematics:
         dtype: torch.dtype = torch.float64,
         device: torch.device | str = "cpu",
     ) -> None:
-        self._laparoscope = None if laparoscope_arm is None else _Arm(robot, laparoscope_arm, dtype, device)
-        self._instrument = _Arm(robot, instrument_arm, dtype, device)
+        bases = [arm.base_T_arm_base for name, arm in robot.arms.items() if name in (laparoscope_arm, instrument_arm)]
+        self.setup_is_stated = all(base is not None for base in bases)
+        """Whether the robot tells where the bases of both arms are; else both are at the identity here."""
+        self._laparoscope = None
+        if laparoscope_arm is not None:
+            self._laparoscope = _Arm(robot, laparoscope_arm, dtype, device, self.setup_is_stated)
+        self._instrument = _Arm(robot, instrument_arm, dtype, device, self.setup_is_stated)
         self.laparoscope_joints = () if self._laparoscope is None else self._laparoscope.names
         """Names of the laparoscope arm's joints, in the order of its readings."""
         self.instrument_joints = self._instrument.names
@@ -92,6 +97,27 @@ class RobotKinematics:
         if joints.shape[-1] != 0:
             raise ShapeError(where="laparoscope readings", expected="(..., 0): no arm", found=tuple(joints.shape))
         return torch.eye(4, dtype=self._dtype, device=self._device).expand(*joints.shape[:-1], 4, 4)
+
+    @property
+    def laparoscope_base_T_instrument_base(self) -> Float[Tensor, "4 4"] | None:
+        """The set-up as the robot states it, or the identity where it states none; None where there is no laparoscope's
+        arm."""
+        if self._laparoscope is None:
+            return None
+        base_T_laparoscope_base = self._laparoscope.base_T_arm_base  # frames: arm_base = laparoscope_base
+        base_T_instrument_base = self._instrument.base_T_arm_base  # frames: arm_base = instrument_base
+        return rigid_inverse(base_T_laparoscope_base) @ base_T_instrument_base
+
+    def laparoscope_base_T_arm(self, joints: Float[Tensor, "*batch j"]) -> Float[Tensor, "*batch 4 4"] | None:
+        """`arm` in the base of the laparoscope's own arm; None where there is no such arm.
+
+        Raises:
+            ShapeError: another number of joints, or another dtype.
+        """
+        if self._laparoscope is None:
+            return None
+        base_T_laparoscope_base = self._laparoscope.base_T_arm_base  # frames: arm_base = laparoscope_base
+        return rigid_inverse(base_T_laparoscope_base) @ self.base_T_arm(joints)
 
     def instrument(self, joints: Float[Tensor, "*batch j"]) -> InstrumentPose:
         """Remote centre, shaft axis, head point and shaft end of the instrument.
@@ -137,11 +163,12 @@ class RobotKinematics:
         return self._instrument.frames_in_base(joints)[..., :3, 3]
 
     def rcm_distance_mm(self) -> float | None:
-        """How far the two arms' remote centres of motion are apart; None where the laparoscope's arm has none.
+        """How far the two arms' remote centres of motion are apart; None where the laparoscope's arm has none, or
+        nobody states where the arms' bases are.
 
         The laparoscope's is the point that the axis of one of its joints passes through, whatever the joints read.
         """
-        if self._laparoscope is None:
+        if self._laparoscope is None or not self.setup_is_stated:
             return None
         frames = self._laparoscope.frames_in_base(self._laparoscope.spread_readings(_PIVOT_SAMPLES))
         pivots = [_common_point(frame[:, :3, 3], frame[:, :3, 2]) for frame in frames.unbind(1)]
@@ -169,7 +196,9 @@ class RobotKinematics:
 class _Arm:
     """Chain of one arm with its constants as tensors."""
 
-    def __init__(self, robot: Robot, name: str, dtype: torch.dtype, device: torch.device | str) -> None:
+    def __init__(
+        self, robot: Robot, name: str, dtype: torch.dtype, device: torch.device | str, base_is_stated: bool = True
+    ) -> None:
         if name not in robot.arms:
             raise RobotError(where=f"robot {robot.name}", expected=f"an arm {name!r}", found=", ".join(robot.arms))
         table = robot.arms[name]
@@ -180,7 +209,7 @@ class _Arm:
         self.names = tuple(row.name for row in table.joints)
         self._rows = table.joints
         self.end_T_tool = constant(table.end_T_tool)
-        self._base_T_arm_base = constant(table.base_T_arm_base)
+        self.base_T_arm_base = constant(table.base_T_arm_base) if base_is_stated else constant(torch.eye(4))
         self._offsets = constant([float(row.offset) for row in table.joints])
         self._chain = build_chain(table.joints, robot.dh_convention, dtype, device)
 
@@ -206,7 +235,7 @@ class _Arm:
         return torch.stack(columns, dim=-1)
 
     def frames_in_base(self, joints: Float[Tensor, "*batch j"]) -> Float[Tensor, "*batch frames 4 4"]:
-        return self._base_T_arm_base @ frame_poses(self._chain, joints + self._offsets)
+        return self.base_T_arm_base @ frame_poses(self._chain, joints + self._offsets)
 
 
 def _common_point(p: Float[Tensor, "n 3"], d: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], float]:

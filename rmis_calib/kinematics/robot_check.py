@@ -40,8 +40,8 @@ class ArmReport:
 def check_robot(robot: Robot) -> list[ArmReport]:
     """Every arm's report."""
     reports = [_check_arm(robot, name, arm) for name, arm in robot.arms.items()]
-    bases = [arm.base_T_arm_base for arm in robot.arms.values()]
-    if len(bases) > 1 and bases[0] is not None and all(np.array_equal(base, bases[0]) for base in bases):
+    bases = [arm.base_T_arm_base for arm in robot.arms.values() if arm.base_T_arm_base is not None]
+    if len(bases) > 1 and all(np.array_equal(base, bases[0]) for base in bases):
         said = "all arms have their base at the same place: base_T_arm_base is still to be filled in"
         reports[0] = _with_problem(reports[0], said)
     return reports

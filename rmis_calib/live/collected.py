@@ -1,6 +1,7 @@
 """The frames of a session as a recording without files."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -101,11 +102,9 @@ class Collected:
 
     def poses(self) -> MotionPoses:
         """Kinematics of all frames."""
-        tensors = {
-            name: torch.cat([getattr(part, name) for part in self._poses])
-            for name in ("arm_T_rcm", "rcm_v_axis", "rcm_s_end_mm", "rcm_p_head")
-        }
-        return MotionPoses(frames=np.arange(len(self)), **tensors)
+        first = self._poses[0]
+        tensors = {name: torch.cat([getattr(part, name) for part in self._poses]) for name in first.by_motion()}
+        return replace(first, frames=np.arange(len(self)), **tensors)
 
     def views(self) -> tuple[View, ...]:
         """Detections of all frames."""

@@ -18,17 +18,18 @@ from torch import Tensor
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.errors import InputError
 from rmis_calib.geometry.cameras import StereoRig
-from rmis_calib.geometry.rigid import RigidTransform, rigid_from_rotation_translation, rigid_inverse
+from rmis_calib.geometry.rigid import RigidTransform, rigid_from_rotation_translation
 from rmis_calib.io import Recording, load_recording
 from rmis_calib.io.robot import load_robot
 from rmis_calib.kinematics import RobotKinematics
 from rmis_calib.live.collected import Collected
-from rmis_calib.pipeline.advice import with_next_motions
+from rmis_calib.pipeline.advice import at_found_setup, with_next_motions
 from rmis_calib.pipeline.association import associate, consistent_choice, read_prior
 from rmis_calib.pipeline.calibration import calibrate_views, solve_choices
 from rmis_calib.pipeline.detection import no_progress
 from rmis_calib.pipeline.observations import DIRECTION_UNKNOWN, assemble, problem_of
-from rmis_calib.pipeline.poses import MotionPoses, predict_contours
+from rmis_calib.pipeline.offset_unknowns import with_setup
+from rmis_calib.pipeline.poses import MotionPoses, poses_of, predict_contours
 from rmis_calib.pipeline.readiness import quick
 from rmis_calib.pipeline.run import CalibrationRun
 from rmis_calib.results import CalibrationResult
@@ -185,12 +186,7 @@ class Session:
     def _poses(self, readings: Float[np.ndarray, " j"]) -> MotionPoses:
         values = torch.as_tensor(readings, device=self._config.device)[None]
         split = len(self._kinematics.laparoscope_joints)
-        instrument = self._kinematics.instrument(values[:, split:])
-        base_T_arm = self._kinematics.base_T_arm(values[:, :split])
-        arm_T_rcm = rigid_inverse(base_T_arm) @ instrument.base_T_rcm
-        return MotionPoses(
-            np.zeros(1, dtype=int), arm_T_rcm, instrument.rcm_v_axis, instrument.rcm_s_end_mm, instrument.rcm_p_head
-        )
+        return poses_of(self._kinematics, np.zeros(1, dtype=int), values[:, :split], values[:, split:])
 
     def _take(self, poses: MotionPoses, found: dict[str, ShaftDetections]) -> str:
         """Let the last frame move the estimate; why it does not, else nothing."""
@@ -217,7 +213,7 @@ class Session:
         self._run, self._contradictions, self._posterior, self._problem = run, 0, None, None
         if run.solution is not None and run.observations is not None and run.result.status != "solver_failed":
             self._posterior = run.solution.posterior
-            self._problem = problem_of(run.observations, self._quick).flatten_batch()
+            self._problem = at_found_setup(problem_of(run.observations, self._quick).flatten_batch(), run.solution)
             # Ten times as long as the solve: it goes on while the arms move to their next place.
             self._advising = self._executor.submit(_advice, run, self._quick)
         self._used = self._solved = max(int(run.result.motions.used.sum()), 1)
@@ -235,12 +231,14 @@ class Session:
         views = tuple(self._collected.view(side, [detections]) for side, detections in found.items())
         # Three times the same motion, of which one is kept: observations of fewer than three are refused.
         thrice = _repeated(poses, 3)
+        placed = with_setup(thrice, self._run.result.kinematic_offsets)
         choices = tuple(
-            consistent_choice(view.at(thrice.frames), predict_contours(camera_T_arm[view.side], thrice, radius_mm))
+            consistent_choice(view.at(thrice.frames), predict_contours(camera_T_arm[view.side], placed, radius_mm))
             for view in views
         )
         observations = assemble(self._run.recording, thrice, views, choices, self._quick)
-        return problem_of(observations, self._quick).select_motions(slice(0, 1))
+        problem = problem_of(observations, self._quick).flatten_batch().select_motions(slice(0, 1))
+        return problem if self._run.solution is None else at_found_setup(problem, self._run.solution)
 
     def _known_advice(self) -> tuple[str, ...]:
         """The advice of the last solve whose advice is there."""
@@ -265,7 +263,7 @@ class Session:
             "ready" if Verdict.of(seen.verdict[0]) is Verdict.TRUSTWORTHY else "weak",
             seen.describe().sentences[0],
             *common,
-            RigidTransform("camera_right", "arm", matrix),
+            RigidTransform("camera_right", self._run.solution.frame, matrix),
             covariance[0].cpu().numpy(),
             self._known_advice(),
         )
@@ -277,10 +275,8 @@ def _advice(run: CalibrationRun, config: CalibrationConfig) -> tuple[str, ...]:
 
 def _repeated(poses: MotionPoses, times: int) -> MotionPoses:
     """One motion several times."""
-    tensors = {
-        name: value.repeat_interleave(times, 0) for name, value in vars(poses).items() if isinstance(value, Tensor)
-    }
-    return MotionPoses(frames=np.repeat(poses.frames, times), **tensors)
+    tensors = {name: value.repeat_interleave(times, 0) for name, value in poses.by_motion().items()}
+    return replace(poses, frames=np.repeat(poses.frames, times), **tensors)
 
 
 def _reason(found: dict[str, ShaftDetections]) -> str:

@@ -26,6 +26,7 @@ from rmis_calib.pipeline.offset_unknowns import KinematicUnknowns, estimated_off
 from rmis_calib.pipeline.result import used_motions
 from rmis_calib.pipeline.run import CalibrationRun
 from rmis_calib.pipeline.words import joined
+from rmis_calib.results import INSTRUMENT_BASE
 from rmis_calib.robot import split_joint_column
 from rmis_calib.solver import Problem, Solution, SolveStatus
 from rmis_calib.solver.assess.next_motion import Advice, advise, measured_alike
@@ -101,7 +102,7 @@ def with_next_motions(run: CalibrationRun, config: CalibrationConfig) -> Calibra
     """The run with the motions in its result that would help most."""
     if run.observations is None or run.solution is None or not may_advise(run.solution, config):
         return run
-    problem = problem_of(run.observations, config)
+    problem = at_found_setup(problem_of(run.observations, config).flatten_batch(), run.solution)
     used, _ = used_motions(run.solution)
     unknowns = KinematicUnknowns(run.recording, run.poses.frames, config.device)
     settings, seed = config.solver.advice, config.solver.seed
@@ -314,7 +315,7 @@ def pose_candidates(problem: Problem, solution: Solution, motion: int, settings:
         motion: index of the motion to start from.
         settings: how far to go.
     """
-    camera_right_T_arm = solution.camera_right_T_arm.reshape(4, 4)
+    camera_right_T_arm, problem = solution.camera_right_T_arm.reshape(4, 4), at_found_setup(problem, solution)
     arm_T_rcm, v = problem.arm_T_rcm[0, motion], problem.rcm_v_axis[0, motion]
     swings = _swings(camera_right_T_arm[:3, :3] @ arm_T_rcm[:3, :3], v, math.radians(settings.reach_deg))
     slides = _slides(problem, settings.reach_mm)
@@ -332,11 +333,23 @@ def pose_candidates(problem: Problem, solution: Solution, motion: int, settings:
         like,
         arm_T_rcm=poses[None],
         rcm_v_axis=turned_v[None],
+        laparoscope_base_T_arm=None
+        if problem.laparoscope_base_T_arm is None
+        else (problem.laparoscope_base_T_arm[0, motion] @ steps)[None],
         clock_derivative=None if like.clock_derivative is None else torch.zeros_like(like.clock_derivative),
         rcm_s_end_mm=like.rcm_s_end_mm + slide_mm,
         rcm_p_head=(turn @ problem.rcm_p_head[0, motion] + slide_mm[:, None] * turned_v)[None],
     )
     return Candidates(at, torch.tensor([len(parts) for parts in words]), tuple(joined(list(parts)) for parts in words))
+
+
+def at_found_setup(problem: Problem, solution: Solution) -> Problem:
+    """The problem, with one trial axis, at the set-up of its answer."""
+    if solution.frame == INSTRUMENT_BASE and problem.laparoscope_base_T_arm is not None:
+        return problem.in_instrument_base()
+    if solution.setup is None:
+        return problem
+    return problem.at_setup(solution.setup.laparoscope_base_T_instrument_base.reshape(1, 4, 4))
 
 
 def _swings(

@@ -21,13 +21,20 @@ from rmis_calib.pipeline.findings import about_motions, about_order
 from rmis_calib.pipeline.frozen import about_repeats, repeated_motions, without_frames
 from rmis_calib.pipeline.misfit import with_misfit_named
 from rmis_calib.pipeline.observations import assemble
-from rmis_calib.pipeline.offset_unknowns import estimated_offsets, poses_at, recording_unknowns, with_rcm_offset
+from rmis_calib.pipeline.offset_unknowns import (
+    estimated_offsets,
+    poses_at,
+    recording_unknowns,
+    with_rcm_offset,
+    with_setup,
+)
 from rmis_calib.pipeline.offsets import estimate_with_kinematics
-from rmis_calib.pipeline.poses import MotionPoses, motion_poses
+from rmis_calib.pipeline.poses import MotionPoses, frame_of, motion_poses
 from rmis_calib.pipeline.result import insufficient_data, make_result, motions_of, residual_of, residuals_px
 from rmis_calib.pipeline.run import CalibrationRun
 from rmis_calib.pipeline.second_look import look_again
 from rmis_calib.results import CalibrationResult
+from rmis_calib.solver.problem import stands_still
 from rmis_calib.vision.masks import Segmenter
 
 CHOICE_ROUNDS = 3
@@ -74,7 +81,7 @@ def run_calibration(
     config = config or CalibrationConfig()
     require_device(config.device)
     prior = read_prior(config)
-    poses = motion_poses(recording, config.device)
+    recording, poses = _without_unknown_arm(recording, motion_poses(recording, config.device))
     views, notes = _detect(recording, config, poses, progress, segment)
     searchable = segment is None and config.masks is None
     return calibrate_views(recording, config, poses, views, prior, notes, progress, second_look=searchable)
@@ -117,6 +124,14 @@ def calibrate_views(
     run = with_next_motions(run, config)
     progress("checking", 1, 1)
     return run
+
+
+def _without_unknown_arm(recording: Recording, poses: MotionPoses) -> tuple[Recording, MotionPoses]:
+    """Without the laparoscope's arm where it stands still and nobody states where the arms' bases are: the pose of the
+    instrument's base in the camera is then all that there is to know."""
+    if poses.setup_is_stated or poses.laparoscope_base_T_arm is None or not stands_still(poses.laparoscope_base_T_arm):
+        return recording, poses
+    return replace(recording, laparoscope_arm=None), poses.in_instrument_base()
 
 
 def _detect(
@@ -258,8 +273,8 @@ def _solve(
     motions = motions_of(recording, views, poses, choices, solution)
     residuals = residuals_px(recording, poses, solution, motions.used)
     columns = () if unknowns is None else unknowns.columns
-    result = make_result(solution, motions, residuals, config, columns, notes)
-    poses = with_rcm_offset(poses, result.kinematic_offsets.rcm_mm)
+    result = make_result(solution, motions, residuals, config, columns, notes, frame_of(recording))
+    poses = with_rcm_offset(with_setup(poses, result.kinematic_offsets), result.kinematic_offsets.rcm_mm)
     errors = head_point_errors(result, recording, poses_at(recording, result.kinematic_offsets, config.device))
     residuals = result.residuals | {
         f"head_{side}": residual_of(distance, "px", np.isfinite(distance)) for side, distance in (errors or {}).items()

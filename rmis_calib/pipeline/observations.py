@@ -46,6 +46,7 @@ def assemble(
         rcm_v_axis=poses.rcm_v_axis.cpu().numpy(),
         camera_left_T_camera_right=extrinsics.matrix.numpy() if extrinsics is not None and len(views) == 2 else None,
         shaft_radius_mm=recording.shaft_diameter_mm / 2,
+        **setup_observations(poses),
         rcm_s_end_mm=poses.rcm_s_end_mm.cpu().numpy(),
         sigma_edge_bias=config.edge_bias_px / float(recording.stereo.right.focal),
         sigma_focal=config.focal_sigma_relative,
@@ -59,6 +60,16 @@ def assemble(
 def problem_of(observations: ShaftObservations, config: CalibrationConfig) -> Problem:
     """The configured kinds of measurement as the solver's tensors."""
     return Problem.from_observations(observations, device=config.device).only(*config.measurements)
+
+
+def setup_observations(poses: MotionPoses) -> dict[str, Any]:
+    """The laparoscope's own kinematics, and the set-up where somebody states it."""
+    if poses.laparoscope_base_T_arm is None or poses.laparoscope_base_T_instrument_base is None:
+        return {}
+    arrays = {"laparoscope_base_T_arm": poses.laparoscope_base_T_arm.cpu().numpy()}
+    if poses.setup_is_stated:
+        arrays["laparoscope_base_T_instrument_base"] = poses.laparoscope_base_T_instrument_base.cpu().numpy()
+    return arrays
 
 
 def head_observations(recording: Recording, poses: MotionPoses) -> dict[str, Any]:

@@ -8,6 +8,7 @@ that is wrong by micrometres.
 
 from abc import ABC, abstractmethod
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,7 +20,7 @@ from rmis_calib.geometry.rigid import rigid_exp, rigid_inverse
 from rmis_calib.io import Recording, ShaftObservations
 from rmis_calib.io.observations import CLOCK
 from rmis_calib.kinematics import RobotKinematics
-from rmis_calib.pipeline.poses import MotionPoses, motion_poses
+from rmis_calib.pipeline.poses import MotionPoses, motion_poses, poses_of
 from rmis_calib.results import KinematicOffsets
 from rmis_calib.robot import split_joint_column
 from rmis_calib.solver import Problem, Solution
@@ -46,11 +47,13 @@ class OffsetUnknowns(ABC):
 
     Attributes:
         columns: `<arm>.<joint>_rad` or `_mm` of each joint offset, laparoscope first.
+        laparoscope_joints: how many of them are the laparoscope's.
         has_clock: whether a clock offset means anything.
         clock_at_s: the clock offset to start from; None: it must be searched for.
     """
 
     columns: tuple[str, ...]
+    laparoscope_joints: int
     has_clock: bool
     clock_at_s: float | None
 
@@ -76,15 +79,21 @@ class OffsetUnknowns(ABC):
         joint_offset: Float[Tensor, "b j"],
         clock_s: Float[Tensor, " b"],
         sigma: Float[Tensor, " j"],
+        setup: Float[Tensor, "b 4 4"] | None = None,
     ) -> Problem:
-        """`at` with the derivatives that make the offsets unknowns; `sigma` is the prior of each joint's."""
-        derivative = self.joint_derivative(joint_offset, clock_s)
-        return replace(
+        """`at` with the derivatives that make the offsets unknowns; `sigma` is the prior of each joint's, `setup` the
+        set-up to evaluate at (None: as stated)."""
+        problem = replace(
             self.at(base, joint_offset, clock_s),
-            joint_derivative=derivative,
+            joint_derivative=self.joint_derivative(joint_offset, clock_s),
             joint_offset_sigma=sigma.expand(len(clock_s), -1),
-            clock_derivative=self.clock_derivative(derivative, clock_s) if self.has_clock else None,
+            laparoscope_joints=self.laparoscope_joints,
         )
+        if setup is not None:
+            problem = problem.at_setup(setup)
+        if not self.has_clock or problem.joint_derivative is None:
+            return problem
+        return replace(problem, clock_derivative=self.clock_derivative(problem.joint_derivative, clock_s))
 
     def moves_shaft(self) -> Bool[Tensor, " j"]:
         """Which joints move the shaft as the camera sees it, at the nominal offsets."""
@@ -112,6 +121,16 @@ class OffsetUnknowns(ABC):
         return {"unknown_names": np.array(names), "unknown_displacement": displacement, "unknown_at": np.array(at)}
 
 
+class _Poses(NamedTuple):
+    """Both arms at any batch of readings; `MotionPoses` has the same for one set of them."""
+
+    arm_T_rcm: Float[Tensor, "*batch 4 4"]
+    rcm_v_axis: Float[Tensor, "*batch 3"]
+    rcm_s_end_mm: Float[Tensor, "*batch"]
+    rcm_p_head: Float[Tensor, "*batch 3"]
+    laparoscope_base_T_arm: Float[Tensor, "*batch 4 4"]
+
+
 class KinematicUnknowns(OffsetUnknowns):
     """The effect of the offsets from the joint log and both arms' kinematics, at any offsets."""
 
@@ -135,7 +154,7 @@ class KinematicUnknowns(OffsetUnknowns):
         self.has_clock = len(intervals_s) > 0 and float(np.median(intervals_s)) <= _CONTINUOUS_LOG_S
         self.clock_at_s = None
         self._device = device
-        self._split = len(self._kinematics.laparoscope_joints)
+        self.laparoscope_joints = len(self._kinematics.laparoscope_joints)
         steps = [_STEP[split_joint_column(column)[1]] for column in self.columns]
         self._steps = torch.tensor(steps, dtype=torch.float64, device=device)
 
@@ -145,14 +164,15 @@ class KinematicUnknowns(OffsetUnknowns):
 
     def at(self, base: Problem, joint_offset: Float[Tensor, "b j"], clock_s: Float[Tensor, " b"]) -> Problem:
         readings, known = self._readings(clock_s)
-        arm_T_rcm, v, s_end, p_head = self._poses(readings + joint_offset[:, None])
+        at = self._poses(readings + joint_offset[:, None])
         repeated = base.take_trials(torch.zeros(len(clock_s), dtype=torch.int64, device=joint_offset.device))
         return replace(
             repeated,
-            arm_T_rcm=arm_T_rcm,
-            rcm_v_axis=v,
-            rcm_s_end_mm=s_end,
-            rcm_p_head=p_head,
+            arm_T_rcm=at.arm_T_rcm,
+            rcm_v_axis=at.rcm_v_axis,
+            rcm_s_end_mm=at.rcm_s_end_mm,
+            rcm_p_head=at.rcm_p_head,
+            laparoscope_base_T_arm=None if repeated.laparoscope_base_T_arm is None else at.laparoscope_base_T_arm,
             valid=repeated.valid & known[:, None],
             joint_offset_at=joint_offset,
             clock_at=clock_s,
@@ -171,36 +191,42 @@ class KinematicUnknowns(OffsetUnknowns):
 
     def resting_at(self, base: Problem, readings: Float[Tensor, "m j"], joint_offset: Float[Tensor, " j"]) -> Problem:
         """The motions of `base` (one trial) with the arms at rest at these readings; rad or mm, offsets to be added."""
-        arm_T_rcm, v, s_end, p_head = self._poses(readings + joint_offset)
+        at = self._poses(readings + joint_offset)
         derivative = self._jacobian((readings + joint_offset)[None])
-        return replace(
+        stated, told = self._kinematics.laparoscope_base_T_instrument_base, base.laparoscope_base_T_arm is not None
+        resting = replace(
             base,
-            arm_T_rcm=arm_T_rcm[None],
-            rcm_v_axis=v[None],
-            rcm_s_end_mm=s_end[None],
-            rcm_p_head=p_head[None],
+            arm_T_rcm=at.arm_T_rcm[None],
+            rcm_v_axis=at.rcm_v_axis[None],
+            rcm_s_end_mm=at.rcm_s_end_mm[None],
+            rcm_p_head=at.rcm_p_head[None],
+            laparoscope_base_T_arm=at.laparoscope_base_T_arm[None] if told else None,
+            laparoscope_base_T_instrument_base=stated[None] if told and stated is not None else None,
             joint_derivative=derivative,
+            laparoscope_joints=self.laparoscope_joints,
             clock_derivative=torch.zeros_like(derivative[..., 0]),
         )
+        setup = base.laparoscope_base_T_instrument_base
+        return resting if setup is None else resting.at_setup(setup)
 
     def motion_poses(
         self, frames: np.ndarray, joint_offset: Float[Tensor, " j"], clock_s: float
     ) -> tuple[MotionPoses, Bool[Tensor, " m"]]:
         """Poses of the motions at one set of offsets, and in which motions the log covers that time."""
         readings, known = self._readings(torch.tensor([clock_s], dtype=torch.float64))
-        arm_T_rcm, v, s_end, p_head = self._poses(readings[0] + joint_offset)
-        return MotionPoses(frames, arm_T_rcm, v, s_end, p_head), known[0]
+        laparoscope, instrument = (readings[0] + joint_offset).tensor_split((self.laparoscope_joints,), dim=-1)
+        return poses_of(self._kinematics, frames, laparoscope, instrument), known[0]
 
-    def _poses(self, readings: Float[Tensor, "*batch j"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _poses(self, readings: Float[Tensor, "*batch j"]) -> "_Poses":
         parts = [self._poses_at_once(part) for part in readings.flatten(0, -2).split(_AT_ONCE)]
-        T, v, s_end, p_head = (torch.cat(part).unflatten(0, readings.shape[:-1]) for part in zip(*parts, strict=True))
-        return T, v, s_end, p_head
+        return _Poses(*(torch.cat(part).unflatten(0, readings.shape[:-1]) for part in zip(*parts, strict=True)))
 
-    def _poses_at_once(self, readings: Float[Tensor, "n j"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        instrument = self._kinematics.instrument(readings[..., self._split :])
-        base_T_arm = self._kinematics.base_T_arm(readings[..., : self._split])
-        arm_T_rcm = rigid_inverse(base_T_arm) @ instrument.base_T_rcm
-        return arm_T_rcm, instrument.rcm_v_axis, instrument.rcm_s_end_mm, instrument.rcm_p_head
+    def _poses_at_once(self, readings: Float[Tensor, "n j"]) -> "_Poses":
+        laparoscope, instrument = readings.tensor_split((self.laparoscope_joints,), dim=-1)
+        pose, own = self._kinematics.instrument(instrument), self._kinematics.laparoscope_base_T_arm(laparoscope)
+        arm_T_rcm = rigid_inverse(self._kinematics.base_T_arm(laparoscope)) @ pose.base_T_rcm
+        own = torch.eye(4).to(arm_T_rcm).expand_as(arm_T_rcm) if own is None else own
+        return _Poses(arm_T_rcm, pose.rcm_v_axis, pose.rcm_s_end_mm, pose.rcm_p_head, own)
 
     def _readings(self, clock_s: Float[Tensor, " b"]) -> tuple[Float[Tensor, "b m j"], Tensor]:
         """Readings at the frames' times, and where the log knows them; the nearest known time elsewhere."""
@@ -223,9 +249,9 @@ class KinematicUnknowns(OffsetUnknowns):
         """Central differences, all joints in one call."""
         steps = torch.diag(self._steps)[:, None]
         both = torch.stack([readings + steps, readings - steps])  # (2, j, n, j)
-        arm_T_rcm, v, s_end, _ = self._poses(both)
-        at_T, at_v, _, _ = self._poses(readings)
-        arm_R_rcm = at_T[..., :3, :3]
+        moved, at = self._poses(both), self._poses(readings)
+        arm_T_rcm, v, s_end = moved.arm_T_rcm, moved.rcm_v_axis, moved.rcm_s_end_mm
+        arm_R_rcm, at_v = at.arm_T_rcm[..., :3, :3], at.rcm_v_axis
         change, scale = arm_T_rcm[0] - arm_T_rcm[1], 2.0 * self._steps[:, None, None]
         turn = arm_R_rcm.mT @ change[..., :3, :3]
         skew = 0.5 * (turn - turn.mT)
@@ -252,6 +278,10 @@ class FileUnknowns(OffsetUnknowns):
         effect = torch.as_tensor(observations.unknown_displacement, device=device).nan_to_num(nan=0.0).mT  # (m, 6, u)
         at = torch.as_tensor(observations.unknown_at, device=device)
         self.columns = tuple(names[index] for index in joints)
+        # The laparoscope's come first; an observations file tells its kinematics only where it has such joints.
+        arms = [column.partition(".")[0] for column in self.columns]
+        both = observations.laparoscope_base_T_arm is not None and len(set(arms)) == 2
+        self.laparoscope_joints = arms.count(arms[0]) if both else 0
         self.has_clock = CLOCK in names
         self._joint, self._joint_at = effect[..., joints], at[joints]
         self.clock_at_s = self._clock_at_s = float(at[names.index(CLOCK)]) if self.has_clock else 0.0
@@ -325,7 +355,7 @@ def poses_at(recording: Recording, offsets: KinematicOffsets, device: str = "cpu
         joint_offset = torch.tensor(values, dtype=torch.float64, device=device)
         poses, known = unknowns.motion_poses(poses.frames, joint_offset, offsets.clock_s)
         poses = poses.select(known)
-    return with_rcm_offset(poses, offsets.rcm_mm)
+    return with_rcm_offset(with_setup(poses, offsets), offsets.rcm_mm)
 
 
 def poses_at_motions(
@@ -335,7 +365,40 @@ def poses_at_motions(
     values = [offsets.joints.get(column, 0.0) for column in unknowns.columns]
     joint_offset = torch.tensor(values, dtype=torch.float64, device=poses.arm_T_rcm.device)
     at, _ = unknowns.motion_poses(poses.frames, joint_offset, offsets.clock_s + later_s)
-    return with_rcm_offset(at, offsets.rcm_mm)
+    return with_rcm_offset(with_setup(at, offsets), offsets.rcm_mm)
+
+
+def with_setup(poses: MotionPoses, offsets: KinematicOffsets) -> MotionPoses:
+    """The poses with the instrument's base where a calibration found it, or in the place of `arm`."""
+    if offsets.arm_is_instrument_base:
+        return poses.in_instrument_base()
+    if offsets.setup is None:
+        return poses
+    return poses.at_setup(offsets.setup.matrix.to(poses.arm_T_rcm))
+
+
+def with_found_bases(recording: Recording, offsets: KinematicOffsets) -> Recording:
+    """The recording with the instrument's base where a calibration found it; without the laparoscope's arm where the
+    instrument's base takes the place of `arm`."""
+    if offsets.arm_is_instrument_base:
+        return replace(recording, laparoscope_arm=None)
+    if offsets.setup is None or recording.laparoscope_arm is None:
+        return recording
+    arms = dict(recording.robot.arms)
+    laparoscope, instrument = arms[recording.laparoscope_arm], arms[recording.instrument_arm]
+    both = laparoscope.base_T_arm_base is not None and instrument.base_T_arm_base is not None
+    base_T_laparoscope_base = laparoscope.base_T_arm_base if both else None
+    base_T_laparoscope_base = np.eye(4) if base_T_laparoscope_base is None else base_T_laparoscope_base
+    base_T_instrument_base = base_T_laparoscope_base @ offsets.setup.matrix.cpu().numpy()
+    arms[recording.laparoscope_arm] = replace(
+        laparoscope,
+        base_T_arm_base=base_T_laparoscope_base,  # frames: laparoscope_base = arm_base
+    )
+    arms[recording.instrument_arm] = replace(
+        instrument,
+        base_T_arm_base=base_T_instrument_base,  # frames: instrument_base = arm_base
+    )
+    return replace(recording, robot=replace(recording.robot, arms=arms))
 
 
 def with_rcm_offset(poses: MotionPoses, rcm_mm: tuple[float, float]) -> MotionPoses:

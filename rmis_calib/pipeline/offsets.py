@@ -64,8 +64,8 @@ def estimate_with_kinematics(
     def solve_with(
         sigma: torch.Tensor, alternative: AlternativeModel | None = None, seen: torch.Tensor | None = None
     ) -> Solution:
-        def kinematics(joint_offset: torch.Tensor, clock_s: torch.Tensor) -> Problem:
-            problem = unknowns.linearised(base, joint_offset, clock_s, sigma)
+        def kinematics(joint_offset: torch.Tensor, clock_s: torch.Tensor, setup: torch.Tensor | None = None) -> Problem:
+            problem = unknowns.linearised(base, joint_offset, clock_s, sigma, setup)
             if seen is None or problem.joint_derivative is None:
                 return problem
             return replace(problem, joint_derivative=problem.joint_derivative @ seen)
@@ -139,7 +139,9 @@ def _clock_start(
     it is clearly better than 0."""
     if unknowns.clock_at_s is not None:
         return unknowns.clock_at_s
-    if not (config.solver.unknowns.clock and unknowns.has_clock):
+    unstated = observations.laparoscope_base_T_arm is not None
+    unstated = unstated and observations.laparoscope_base_T_instrument_base is None
+    if not (config.solver.unknowns.clock and unknowns.has_clock) or unstated:  # lines and joints never agree then
         return 0.0
     # Whatever is measured: the axis lines tell the clock even where the answer does not use them.
     base = Problem.from_observations(observations, device=config.device).only("axis").flatten_batch()

@@ -15,7 +15,7 @@ from torch import Tensor
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.geometry.cameras import Camera
 from rmis_calib.io import FrameBatch, FrameSource, Recording, load_recording
-from rmis_calib.pipeline.advice import camera_view, may_advise
+from rmis_calib.pipeline.advice import at_found_setup, camera_view, may_advise
 from rmis_calib.pipeline.association import associate, read_prior
 from rmis_calib.pipeline.calibration import solve_choices
 from rmis_calib.pipeline.detection import View, no_progress, over_all
@@ -187,7 +187,7 @@ def _expected(run: CalibrationRun, config: CalibrationConfig) -> tuple[Finding, 
     all_poses = motion_poses(recording, config.device)
     spread = np.unique(np.linspace(0, len(all_poses.frames) - 1, _PREDICTED_MOTIONS).astype(int))
     unknowns = KinematicUnknowns(recording, all_poses.frames[spread], config.device)
-    problem = problem_of(run.observations, config).flatten_batch()
+    problem = at_found_setup(problem_of(run.observations, config).flatten_batch(), solution)
     readings = unknowns.readings_of_motions(0.0)
     at = unknowns.resting_at(measured_alike(problem, len(spread)), readings, torch.zeros_like(readings[0]))
     cameras = [camera for camera in (recording.stereo.right, recording.stereo.left) if camera is not None]

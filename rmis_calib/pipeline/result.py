@@ -12,6 +12,7 @@ from rmis_calib.pipeline.association import Choice
 from rmis_calib.pipeline.detection import View
 from rmis_calib.pipeline.observations import reasons_for
 from rmis_calib.pipeline.poses import MotionPoses
+from rmis_calib.pipeline.setup_record import about_compliance, about_setup, given_way, setup_of
 from rmis_calib.pipeline.words import ranges_in_words, words_of
 from rmis_calib.results import (
     INTRINSICS,
@@ -42,7 +43,7 @@ CORRECTED = 1.0
 """Correction of a camera in prior sigmas from which it is said."""
 WORTH_SAYING = 1.25
 """Growth of sigma by disagreeing groups from which it is said."""
-OF_ONE_RECORDING = ("clock", "joint_offset", "rcm_offset")
+OF_ONE_RECORDING = ("clock", "joint_offset", "rcm_offset", "setup")
 """Unknowns that another recording of the same set-up need not share."""
 TOO_FAR_SIGMA = 4.0
 """An unknown estimated this many prior sigmas from its nominal value says that the model does not fit the data."""
@@ -55,9 +56,11 @@ def make_result(
     config: CalibrationConfig,
     joint_columns: tuple[str, ...] = (),
     notes: tuple[str, ...] = (),
+    frame: str | None = None,
 ) -> CalibrationResult:
     """The result of one solve (no trial batch); `joint_columns` name its joint offsets, `notes` join what is said of
-    the data."""
+    the data, `frame` is what the motions call `arm` (default: what the solution calls it)."""
+    frame = frame or solution.frame
     status, message = judge(solution)
     consistency = consistency_of(solution)
     observability = solution.observability.describe()
@@ -67,6 +70,8 @@ def make_result(
         *_about_ends(solution),
         *about_groups(consistency),
         *about_cameras(solution),
+        *about_setup(solution, frame),
+        *about_compliance(solution),
     )
     finite = bool(torch.isfinite(solution.camera_right_T_arm).all())
     covariance = solution.covariance.cpu().numpy()
@@ -75,7 +80,7 @@ def make_result(
         status=status,
         message=message,
         method=solution.method,
-        camera_right_T_arm=_transform("camera_right", "arm", solution.camera_right_T_arm) if finite else None,
+        camera_right_T_arm=_transform("camera_right", frame, solution.camera_right_T_arm) if finite else None,
         camera_left_T_camera_right=None if stereo is None else _transform("camera_left", "camera_right", stereo),
         covariance=covariance if np.isfinite(covariance).all() else None,
         observability=replace(observability, sentences=(*observability.sentences, *notes)),
@@ -83,6 +88,7 @@ def make_result(
         residuals=residuals,
         nuisances=_nuisances(solution, joint_columns),
         consistency=consistency,
+        setup=setup_of(solution),
         information=_information(solution),
         config=config.to_dict(),
     )
@@ -135,7 +141,9 @@ def judge(solution: Solution) -> tuple[Status, str]:
 def _strange_unknown(solution: Solution) -> str:
     """The unknown that is furthest from its nominal value, in words, when it is further than its prior allows."""
     # A lens model wrong by a tenth of a pixel is no reason for doubt: that is what `edge_bias` is there to take.
-    unknowns = {name: item for name, item in solution.nuisances.items() if name != "edge_bias"}
+    # What an arm gives way is said in its own words (`about_compliance`).
+    expected = ("edge_bias", "compliance")
+    unknowns = {name: item for name, item in solution.nuisances.items() if name not in expected}
     pulls = {name: float(nuisance.pull.abs().max()) for name, nuisance in unknowns.items()}
     worst = max(pulls, key=lambda name: pulls[name], default="")
     if not worst or pulls[worst] <= TOO_FAR_SIGMA:
@@ -189,6 +197,13 @@ def _nuisances(solution: Solution, joint_columns: tuple[str, ...]) -> dict[str, 
     """Every other unknown with its sigma, and the noise levels that were used."""
     found: dict[str, Nuisance] = {}
     for name, nuisance in solution.nuisances.items():
+        if name == "setup":  # has a record of its own
+            continue
+        if name == "compliance":
+            bend_rad, shift_mm = given_way(nuisance)
+            found["compliance bend"] = Nuisance(bend_rad, None, "rad rms")
+            found["compliance shift"] = Nuisance(shift_mm, None, "mm rms")
+            continue
         values, sigmas, held = (item.reshape(-1).tolist() for item in (nuisance.value, nuisance.sigma, nuisance.held))
         for index, (value, sigma, is_held) in enumerate(zip(values, sigmas, held, strict=True)):
             key = name if len(values) == 1 else f"{name}[{index}]"

@@ -12,7 +12,7 @@ from rmis_calib.errors import InputError
 from rmis_calib.geometry.rigid import rigid_inverse, transform_points
 from rmis_calib.io import Recording
 from rmis_calib.kinematics import RobotKinematics
-from rmis_calib.pipeline.offset_unknowns import KinematicUnknowns, poses_at
+from rmis_calib.pipeline.offset_unknowns import KinematicUnknowns, poses_at, with_found_bases
 from rmis_calib.results import CalibrationResult, KinematicOffsets
 
 _NO_OFFSETS = KinematicOffsets({}, 0.0, (0.0, 0.0))
@@ -143,8 +143,10 @@ def _scene(
     """The arms at these readings, to which the result's joint offsets are added."""
     found = {} if result is None else result.kinematic_offsets.joints
     readings = readings + torch.tensor([found.get(column, 0.0) for column in columns], dtype=torch.float64)
-    kinematics = RobotKinematics(recording.robot, recording.laparoscope_arm, recording.instrument_arm)
+    placed = recording if result is None else with_found_bases(recording, result.kinematic_offsets)
+    kinematics = RobotKinematics(placed.robot, placed.laparoscope_arm, placed.instrument_arm)
     split = len(kinematics.laparoscope_joints)
+    readings = readings[:, len(columns) - split - len(kinematics.instrument_joints) :]
     instrument, base_T_arm = kinematics.instrument(readings[:, split:]), kinematics.base_T_arm(readings[:, :split])
     offset = 0.0 if result is None or "end_offset" not in result.nuisances else result.nuisances["end_offset"].value
     radius = None if result is None or "radius" not in result.nuisances else result.nuisances["radius"].value

@@ -7,8 +7,10 @@ from .parts import KinematicOffsets as KinematicOffsets
 from .parts import Motions as Motions
 from .parts import Nuisance as Nuisance
 from .parts import Residual as Residual
+from .parts import Setup as Setup
 from .parts import Shift as Shift
 from .parts import covariance_of as covariance_of
+from .result import INSTRUMENT_BASE as INSTRUMENT_BASE
 from .result import INTRINSICS as INTRINSICS
 from .result import JOINT_OFFSET as JOINT_OFFSET
 from .result import STATUS_SENTENCES as STATUS_SENTENCES

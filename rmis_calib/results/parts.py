@@ -8,7 +8,7 @@ from jaxtyping import Float
 from pydantic import Field, computed_field, model_serializer, model_validator
 from pydantic.dataclasses import dataclass
 
-from rmis_calib.io.plain_values import FILE_PART, Flags, Indices, Number, Square, Vector
+from rmis_calib.io.plain_values import FILE_PART, Flags, Indices, Number, Square, Transform, Vector
 
 
 @dataclass(frozen=True, eq=False, config=FILE_PART)
@@ -164,7 +164,26 @@ def covariance_of(information: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n
     return np.linalg.inv(information * root[:, None] * root) * root[:, None] * root
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, config=FILE_PART)
+class Setup:
+    """The pose of the instrument's base in the laparoscope's, where it was estimated."""
+
+    laparoscope_base_T_instrument_base: Transform
+    """The estimate, mm."""
+    rotation_sigma_deg: Number
+    """Root of the trace of its covariance's rotation block, degrees."""
+    translation_sigma_mm: Number
+    """Root of the trace of the translation block, mm."""
+    from_stated_deg: Number
+    """Angle from what `base_T_arm_base` states, degrees; null where nothing states it."""
+    from_stated_mm: Number
+    """Distance of the instrument's base from where it is stated, mm; null likewise."""
+    covariance: Square
+    """(12, 12) of `camera_right_T_arm`, then of this transform: each rotation first, R = exp(dphi) R^, t = t^ + dt; rad
+    and mm."""
+
+
+@dataclass(frozen=True, config=FILE_PART)
 class KinematicOffsets:
     """What was found to be off in the logged kinematics; zero where it was not estimated."""
 
@@ -174,3 +193,7 @@ class KinematicOffsets:
     """Added to the times at which the joints are read, beside the recording's own offset."""
     rcm_mm: tuple[float, float]
     """Of the shaft's axis from the nominal RCM, along two directions across it that are fixed to `rcm`."""
+    setup: Transform | None = None
+    """`laparoscope_base_T_instrument_base`, mm; None where it was not estimated."""
+    arm_is_instrument_base: bool = False
+    """Whether the instrument's base takes the place of `arm`."""

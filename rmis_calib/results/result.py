@@ -32,11 +32,15 @@ from rmis_calib.results.parts import (
     Motions,
     Nuisance,
     Residual,
+    Setup,
 )
 from rmis_calib.solver.observability import Observability
 from rmis_calib.solver.settings import Method
 
 Status = Literal["ok", "weak", "unobservable", "solver_failed", "insufficient_data"]
+
+INSTRUMENT_BASE = "instrument_base"
+"""The frame that takes the place of `arm` where the laparoscope stands still and nobody states the set-up."""
 
 JOINT_OFFSET = "joint_offset "
 """How the name of a joint's offset among the nuisances begins; its column without the unit follows."""
@@ -115,6 +119,9 @@ class CalibrationResult:
     consistency: Consistency | None = None
     """Groups of neighbouring motions left out in turn, and parts of the data against each other; null for `paper` and
     `global`, and for few motions."""
+    setup: Setup | None = None
+    """The pose of one arm's base in the other's with the covariance of both transforms; absent where it was not
+    estimated."""
     information: Information | None = None
     """What pooling with other recordings needs beside the covariance; null for `paper` and `global`."""
     created: str = field(default_factory=_now)
@@ -139,7 +146,10 @@ class CalibrationResult:
             if name.startswith(JOINT_OFFSET)
         }
         rcm_mm = (self.nuisance("rcm_offset[0]"), self.nuisance("rcm_offset[1]"))
-        return KinematicOffsets(joints, self.nuisance("clock"), rcm_mm)
+        setup = None if self.setup is None else self.setup.laparoscope_base_T_instrument_base
+        found = self.camera_right_T_arm
+        in_base = found is not None and found.src == INSTRUMENT_BASE
+        return KinematicOffsets(joints, self.nuisance("clock"), rcm_mm, setup, in_base)
 
     def nuisance(self, name: str, otherwise: float = 0.0) -> float:
         """Value of a nuisance in its unit; `otherwise` where it was not estimated."""
@@ -179,6 +189,8 @@ class CalibrationResult:
     def to_dict(self) -> dict[str, Any]:
         """The result as plain JSON values, every number finite or None; the answer first."""
         record = record_type().dump_python(self, mode="json", by_alias=True)
+        if record["setup"] is None:  # as in results of before
+            del record["setup"]
         return {key: record[key] for key in (*_ANSWER, *record)}
 
     def write(self, path: str | Path) -> None:

@@ -17,12 +17,13 @@ from rmis_calib.solver.assess.assemble import (
     two_step_solution,
 )
 from rmis_calib.solver.assess.information import motion_information, select_d_optimal
+from rmis_calib.solver.estimate.evidence import CHANCE, chances, freed
 from rmis_calib.solver.estimate.map_estimate import map_estimate
-from rmis_calib.solver.estimate.relinearise import Kinematics, solve_relinearised
+from rmis_calib.solver.estimate.relinearise import Kinematics, solve_relinearised, start_of
 from rmis_calib.solver.model.measurement_rows import pack
 from rmis_calib.solver.problem import MIN_MOTIONS, Problem
 from rmis_calib.solver.settings import Method, SolverSettings
-from rmis_calib.solver.solution import AlternativeModel, Solution, concatenate, map_tensors
+from rmis_calib.solver.solution import AlternativeModel, Solution, concatenate, map_tensors, take_solved
 from rmis_calib.solver.start.candidates import best_candidate
 from rmis_calib.solver.start.line_statistics import LineStatistics
 from rmis_calib.solver.start.paper import average, empirical_covariance, influence, solve_paper, votes
@@ -66,9 +67,14 @@ def solve(
         raise InputError(
             where="differentiable", expected="a solve without kinematics of offsets", found="one with them"
         )
+    settings = with_setup(settings, problem, method or settings.method)
+    flat, frame = problem.flatten_batch(), "arm"
+    if settings.unknowns.setup == "free" and bool(flat.laparoscope_stands_still.all()):
+        flat, frame, kinematics = flat.in_instrument_base(), "instrument_base", None
+        settings = replace(settings, unknowns=replace(settings.unknowns, setup="known"))
     with torch.inference_mode(not differentiable):  # no graph is kept: a fifth of the time of 1,728 motions
-        solution = _solve_groups(problem.flatten_batch(), settings, method or settings.method, kinematics, alternative)
-    return _shaped(solution, problem.batch_shape)
+        solution = _solve_groups(flat, settings, method or settings.method, kinematics, alternative)
+    return replace(_shaped(solution, problem.batch_shape), frame=frame)
 
 
 def _solve_groups(
@@ -83,11 +89,44 @@ def _solve_groups(
     count = max(1, GROUP_MOTIONS // flat.n_motions)
     alone = kinematics is not None or alternative is not None or settings.thin_to is not None
     if flat.n_trials <= count or alone:
-        return _solve_flat(flat, settings, method, kinematics, alternative)
+        return _solve_by_evidence(flat, settings, method, kinematics, alternative)
     groups = [
-        _solve_flat(flat.take_trials(slice(b, b + count)), settings, method) for b in range(0, flat.n_trials, count)
+        _solve_by_evidence(flat.take_trials(slice(b, b + count)), settings, method)
+        for b in range(0, flat.n_trials, count)
     ]
     return concatenate(groups)
+
+
+def _solve_by_evidence(
+    flat: Problem,
+    settings: SolverSettings,
+    method: Method,
+    kinematics: Kinematics | None = None,
+    alternative: AlternativeModel | None = None,
+) -> Solution:
+    """Trials that are solved together; where the data ask for an unknown that was left out, they are solved again with
+    it, that of least chance first."""
+    solution = _solve_flat(flat, settings, method, kinematics, alternative)
+    if not solution.evidence:
+        return solution
+    names = list(solution.evidence)
+    chances_of = torch.stack([solution.evidence[name] / CHANCE[name] for name in names])
+    which = torch.where(chances_of.amin(0) < 1.0, chances_of.argmin(0), -1)
+    if bool((which < 0).all()):
+        return solution
+    parts, order = [], []
+    for number, name in enumerate([None, *names]):
+        index = torch.nonzero(which == number - 1)[:, 0]
+        if not len(index):
+            continue
+        part = take_solved(solution, index)
+        if name is not None:
+            with_it = replace(settings, unknowns=freed(settings.unknowns, name))
+            again = _solve_by_evidence(flat.take_trials(index), with_it, method, kinematics, alternative)
+            part = replace(again, evidence=part.evidence)
+        parts.append(part)
+        order.append(index)
+    return take_solved(concatenate(parts), torch.cat(order).argsort())
 
 
 def _solve_flat(
@@ -105,13 +144,17 @@ def _solve_flat(
         if settings.thin_to is not None and settings.thin_to < flat.n_motions:
             index, kept = _informative(flat, settings, settings.thin_to)
             chosen = flat.select_motions(index)
-        if kinematics is None:
+        if kinematics is None and settings.unknowns.setup == "known":
             fit = map_estimate(chosen.detach(), settings)
         else:
-            fit = solve_relinearised(chosen, settings, _of_motions(kinematics, index))
-        solution = joint_solution(fit, settings, alternative)
+            own = _of_motions(kinematics, index)
+            fit = solve_relinearised(start_of(chosen.detach(), settings, own), settings, own)
+        solution = replace(joint_solution(fit, settings, alternative), evidence=chances(fit, settings))
     if on_graph:
-        solution = joint_on_graph(solution, flat if index is None else flat.select_motions(index), fit, settings)
+        attached = flat if index is None else flat.select_motions(index)
+        if settings.unknowns.setup != "known":
+            attached = attached.at_setup(fit.problem.chains[1])
+        solution = joint_on_graph(solution, attached, fit, settings)
     return solution if index is None else replace(_spread(solution, index, flat.n_motions), information_kept=kept)
 
 
@@ -147,11 +190,36 @@ def _two_step_estimate(
     return R, t, empirical_covariance(shares) * (part.n_motions / flat.n_motions)
 
 
-def _of_motions(kinematics: Kinematics, index: Int[Tensor, " k"] | None) -> Kinematics:
+def with_setup(settings: SolverSettings, problem: Problem, method: Method) -> SolverSettings:
+    """The settings with what becomes of the set-up: `free` wherever nothing states it.
+
+    Raises:
+        ObservationsError: it is to be an unknown, and the laparoscope's own kinematics are not told.
+        InputError: it must be an unknown, and the method has none.
+    """
+    asked = settings.unknowns.setup
+    if problem.setup_stated is None:
+        if asked != "known":
+            raise ObservationsError(
+                where=f"solver.unknowns.setup: {asked}", expected="laparoscope_base_T_arm of every motion", found="none"
+            )
+        return settings
+    stated = torch.isfinite(problem.setup_stated).flatten(-2).all(-1)
+    chosen = asked if bool(stated.all()) else "free"
+    if chosen != "known" and method != "joint":
+        raise InputError(
+            where="method",
+            expected="joint, where the set-up (laparoscope_base_T_instrument_base) is an unknown",
+            found=method,
+        )
+    return replace(settings, unknowns=replace(settings.unknowns, setup=chosen))
+
+
+def _of_motions(kinematics: Kinematics | None, index: Int[Tensor, " k"] | None) -> Kinematics | None:
     """The kinematics of some motions alone."""
-    if index is None:
+    if index is None or kinematics is None:
         return kinematics
-    return lambda joint_offset, clock_s: kinematics(joint_offset, clock_s).select_motions(index)
+    return lambda *at: kinematics(*at).select_motions(index)
 
 
 def _informative(flat: Problem, settings: SolverSettings, count: int) -> tuple[Int[Tensor, " k"], float]:

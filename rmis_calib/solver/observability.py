@@ -48,6 +48,7 @@ class Degeneracy(IntFlag):
     MOTION_BELOW_NOISE = 16
     SHORT_BASELINE = 32
     NO_ALONG_AXIS_CUE = 64
+    SETUP_AND_TRANSFORM = 128
 
 
 _SENTENCES = {
@@ -58,6 +59,9 @@ _SENTENCES = {
     Degeneracy.MOTION_BELOW_NOISE: "the motion is below the noise of the kinematics",
     Degeneracy.SHORT_BASELINE: "the stereo baseline is too short to tell depth",
     Degeneracy.NO_ALONG_AXIS_CUE: "nothing tells the place along the shaft",
+    Degeneracy.SETUP_AND_TRANSFORM: (
+        "the laparoscope did not turn about two axes, so that its transform is not told from the unknown set-up"
+    ),
 }
 
 
@@ -68,6 +72,9 @@ _REMEDIES = {
     Degeneracy.ONE_PLANE: "move the instrument out of the plane that it stayed in",
     Degeneracy.MOTION_BELOW_NOISE: "move farther: several degrees and centimetres",
     Degeneracy.SHORT_BASELINE: "use the shaft's diameter for the distance, as with one camera",
+    Degeneracy.SETUP_AND_TRANSFORM: (
+        "turn the laparoscope about two axes by 10 degrees each, or state where the arms' bases are (base_T_arm_base)"
+    ),
     Degeneracy.NO_ALONG_AXIS_CUE: "keep the end of the dark shaft in view, or label head points",
 }
 

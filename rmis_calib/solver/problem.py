@@ -14,10 +14,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rmis_calib.errors import InputError, InsufficientDataError, ObservationsError
+from rmis_calib.geometry.rigid import rigid_inverse
 from rmis_calib.solver.own_measurement import Measurement
 
 MIN_MOTIONS = 3
 CAMERAS = ("right", "left")
+STILL_RAD, STILL_MM = 2e-3, 0.2
+"""Reach of an arm that holds still (0.1 degrees of encoder noise, and what a hand does to it)."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,8 @@ class NoiseLevels:
         focal: of each camera's focal length, relative.
         centre: of its principal point, per axis, in focal lengths.
         lens: of its radial distortion k1.
+        setup_mm: per axis, of the stated `laparoscope_base_T_instrument_base` (right perturbation).
+        setup_rad: its orientation.
     """
 
     image: Float[Tensor, "*batch"]
@@ -49,6 +54,8 @@ class NoiseLevels:
     focal: Float[Tensor, "*batch"]
     centre: Float[Tensor, "*batch"]
     lens: Float[Tensor, "*batch"]
+    setup_mm: Float[Tensor, "*batch"]
+    setup_rad: Float[Tensor, "*batch"]
 
 
 @dataclass(frozen=True)
@@ -78,9 +85,14 @@ class Problem:
             `rcm_v_axis` enters as v x dv, a change of the insertion as v ds.
         joint_offset_sigma: prior of each joint's offset, in its unit.
         clock_derivative: the same displacement per second of clock offset, [motion, 6].
+        laparoscope_joints: how many of the joints, the first ones, are the laparoscope's.
         joint_offset_at: joint offsets at which the kinematics here were evaluated; None: zero.
         clock_at: clock offset, s, likewise.
         own: measurements of the user's own.
+        laparoscope_base_T_arm: forward kinematics of the laparoscope's arm in its own base; None where the set-up
+            (the pose of one arm's base in the other's) cannot be an unknown.
+        laparoscope_base_T_instrument_base: the set-up at which `arm_T_rcm` was evaluated.
+        setup_stated: the set-up that the user states; NaN: unknown.
     """
 
     arm_T_rcm: Float[Tensor, "*batch n 4 4"]
@@ -105,6 +117,10 @@ class Problem:
     joint_offset_at: Float[Tensor, "*batch j"] | None = None
     clock_at: Float[Tensor, "*batch"] | None = None
     own: tuple[Measurement, ...] = ()
+    laparoscope_base_T_arm: Float[Tensor, "*batch n 4 4"] | None = None
+    laparoscope_base_T_instrument_base: Float[Tensor, "*batch 4 4"] | None = None
+    setup_stated: Float[Tensor, "*batch 4 4"] | None = None
+    laparoscope_joints: int = 0
 
     @property
     def batch_shape(self) -> torch.Size:
@@ -121,6 +137,72 @@ class Problem:
     @property
     def n_trials(self) -> int:
         return self.batch_shape.numel()
+
+    @property
+    def instrument_base_T_rcm(self) -> Float[Tensor, "*batch n 4 4"]:
+        """Forward kinematics of the instrument in its own base: what `arm_T_rcm` says at the set-up it was evaluated
+        at.
+
+        Raises:
+            ObservationsError: the laparoscope's own kinematics are not told.
+        """
+        laparoscope, setup = self.chains
+        return rigid_inverse(setup)[..., None, :, :] @ laparoscope @ self.arm_T_rcm
+
+    @property
+    def chains(self) -> tuple[Float[Tensor, "*batch n 4 4"], Float[Tensor, "*batch 4 4"]]:
+        """`laparoscope_base_T_arm` and `laparoscope_base_T_instrument_base`.
+
+        Raises:
+            ObservationsError: they are not told.
+        """
+        if self.laparoscope_base_T_arm is None or self.laparoscope_base_T_instrument_base is None:
+            raise ObservationsError(
+                where="the set-up as an unknown", expected="laparoscope_base_T_arm of every motion", found="none"
+            )
+        return self.laparoscope_base_T_arm, self.laparoscope_base_T_instrument_base
+
+    def at_setup(self, setup: Float[Tensor, "*batch 4 4"]) -> "Problem":
+        """The problem with the instrument's arm where this `laparoscope_base_T_instrument_base` puts it.
+
+        What the laparoscope's joints do to the shaft stays the same in `arm`, and so turns in `rcm`; the derivative for
+        the clock, a mixture of both arms', stays as it is.
+        """
+        laparoscope, _ = self.chains
+        arm_T_rcm = rigid_inverse(laparoscope) @ setup[..., None, :, :] @ self.instrument_base_T_rcm
+        moved = replace(self, arm_T_rcm=arm_T_rcm, laparoscope_base_T_instrument_base=setup)
+        if self.joint_derivative is None or self.laparoscope_joints == 0:
+            return moved
+        of_laparoscope, others = self.joint_derivative.tensor_split((self.laparoscope_joints,), dim=-1)
+        before, after = self.arm_T_rcm, arm_T_rcm
+        turn, shift = (before[..., :3, :3] @ part for part in of_laparoscope.tensor_split(2, dim=-2))
+        shift = shift + torch.linalg.cross(turn, (after - before)[..., :3, 3:].expand_as(turn), dim=-2)
+        turned = torch.cat((after[..., :3, :3].mT @ turn, after[..., :3, :3].mT @ shift), dim=-2)
+        return replace(moved, joint_derivative=torch.cat((turned, others), dim=-1))
+
+    def in_instrument_base(self) -> "Problem":
+        """The problem with the instrument's base in the place of `arm`: what remains where the laparoscope stands still
+        and nobody knows where the instrument's base is. Offsets of joints cannot be told then."""
+        return replace(
+            self,
+            arm_T_rcm=self.instrument_base_T_rcm,  # frames: instrument_base = arm
+            laparoscope_base_T_arm=None,
+            laparoscope_base_T_instrument_base=None,
+            setup_stated=None,
+            joint_derivative=None,
+            joint_offset_sigma=None,
+            joint_offset_at=None,
+            laparoscope_joints=0,
+        )
+
+    @property
+    def laparoscope_stands_still(self) -> Bool[Tensor, "*batch"]:
+        """Whether the laparoscope's own joints do not move it beyond what no calibration could use.
+
+        Raises:
+            ObservationsError: the laparoscope's own kinematics are not told.
+        """
+        return stands_still(self.chains[0])
 
     def with_own(self, own: Sequence[Measurement]) -> "Problem":
         """The problem with measurements of the user's own.
@@ -201,6 +283,7 @@ class Problem:
             "valid",
         }
         constant = {"camera_T_camera_right", "radius_mm", "joint_offset_sigma", "joint_offset_at", "clock_at"}
+        constant |= {"laparoscope_base_T_instrument_base", "setup_stated"}
         changed: dict[str, Any] = {}
         for field in fields(self):
             value = getattr(self, field.name)
@@ -230,12 +313,22 @@ class Problem:
         return _Reader(arrays, dtype, device).problem()
 
 
+def stands_still(laparoscope_base_T_arm: Float[Tensor, "*batch n 4 4"]) -> Bool[Tensor, "*batch"]:
+    """Whether an arm stays within STILL_RAD and STILL_MM of where it first is."""
+    first = laparoscope_base_T_arm[..., :1, :, :]
+    away = laparoscope_base_T_arm - first
+    turned = away[..., :3, :3].square().sum((-2, -1)).sqrt().amax(-1)
+    moved = torch.linalg.vector_norm(away[..., :3, 3], dim=-1).amax(-1)
+    return (turned < STILL_RAD) & (moved < STILL_MM)
+
+
 OBSERVATION_KEYS = (
     "arm_T_rcm", "rcm_v_axis", "camera_left_T_camera_right", "axis_right", "axis_left", "contour_right",
     "contour_left", "shaft_radius_mm", "end_right", "end_left", "rcm_s_end_mm", "head_right", "head_left",
     "rcm_p_head", "valid_right", "valid_left", "sigma_image", "sigma_kinematics_mm", "sigma_kinematics_rad",
     "sigma_camera_mm", "sigma_camera_rad", "sigma_stereo_mm", "sigma_edge_bias", "sigma_stereo_rad",
-    "sigma_focal", "sigma_centre", "sigma_lens",
+    "sigma_focal", "sigma_centre", "sigma_lens", "sigma_setup_mm", "sigma_setup_rad", "laparoscope_base_T_arm",
+    "laparoscope_base_T_instrument_base",
     "sigma_axis_right", "sigma_axis_left", "sigma_contour_right", "sigma_contour_left", "sigma_end_right",
     "sigma_end_left", "sigma_head_right", "sigma_head_left",
 )  # fmt: skip
@@ -310,7 +403,7 @@ class _Reader:
             raise ObservationsError(
                 where="rcm_v_axis", expected="finite unit directions", found="a zero or infinite one"
             )
-        return Problem(
+        problem = Problem(
             arm_T_rcm=poses,
             rcm_v_axis=v / length[..., None],
             camera_T_camera_right=torch.stack(cameras, dim=-3),
@@ -327,6 +420,22 @@ class _Reader:
             rcm_p_head=self.filled("rcm_p_head", self.n, 3),
             radius_mm=self.filled("shaft_radius_mm"),
             noise=self.noise(),
+        )
+        return self._with_chains(problem, first, unknown)
+
+    def _with_chains(self, problem: Problem, first: Tensor, unknown: Tensor) -> Problem:
+        """The laparoscope's own kinematics and the set-up, where they are told; unknown motions as for `arm_T_rcm`."""
+        if self.arrays.get("laparoscope_base_T_arm") is None:
+            return problem
+        poses = self.filled("laparoscope_base_T_arm", self.n, 4, 4)
+        poses = torch.where(unknown[..., None, None], torch.take_along_dim(poses, first[..., None, None], -3), poses)
+        stated = self.filled("laparoscope_base_T_instrument_base", 4, 4)
+        eye = torch.eye(4, dtype=self.dtype, device=self.device).expand(*self.batch, 4, 4)
+        return replace(
+            problem,
+            laparoscope_base_T_arm=poses,
+            laparoscope_base_T_instrument_base=torch.where(torch.isnan(stated), eye, stated),
+            setup_stated=stated,
         )
 
     def _valid(self, side: str) -> Tensor:

@@ -74,6 +74,23 @@ class UnknownSettings:
     """Correct each camera's focal length, principal point and radial distortion, where the observations name their
     priors (`sigma_focal`, `sigma_centre`, `sigma_lens`). A camera that stands still absorbs wrong ones without a trace:
     there only the priors enter the covariance."""
+    setup: Literal["known", "prior", "free"] = "known"
+    """The pose of the instrument's base in the laparoscope's: believed as stated, estimated within a prior about that,
+    or estimated with no prior. Where nothing states it, it is always `free`. A `known` one that the data contradict is
+    estimated within the prior, and the result says so."""
+    setup_sigma_mm: Positive = 50.0
+    """Prior of the stated set-up's translation, per axis, where the observations name none: what passive joints
+    without good encoders tell."""
+    setup_sigma_deg: Positive = 5.0
+    """Prior of its orientation, likewise."""
+    compliance: Literal["never", "auto", "always"] = "auto"
+    """Estimate by how much the instrument's arm gives way: a bend and a shift of the shaft that change smoothly with
+    its pose (a flexing cannula, a remote centre that moves, joints that wind up). `auto`: where the
+    laparoscope moves, its own kinematics are told, and the data ask for it."""
+    compliance_sigma_deg: Positive = 0.1
+    """Prior of each coefficient of the bend."""
+    compliance_sigma_mm: Positive = 0.3
+    """Prior of each coefficient of the shift."""
     held_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.95
     """An unknown whose sigma the data do not bring below this part of its prior is reported as held."""
 

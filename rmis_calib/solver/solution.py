@@ -33,6 +33,23 @@ class Nuisance:
 
 
 @dataclass(frozen=True)
+class SetupEstimate:
+    """The set-up, where it was an unknown.
+
+    Attributes:
+        laparoscope_base_T_instrument_base: the estimate; mm.
+        covariance: of both transforms together: `camera_right_T_arm` first, then the set-up; each rotation first, with
+            R = exp(dphi) R^ and t = t^ + dt; rad and mm.
+        from_stated: rotation vector and translation from the stated set-up, in `instrument_base`; rad and mm; NaN
+            where none was stated.
+    """
+
+    laparoscope_base_T_instrument_base: Float[Tensor, "*batch 4 4"]
+    covariance: Float[Tensor, "*batch 12 12"]
+    from_stated: Float[Tensor, "*batch 6"]
+
+
+@dataclass(frozen=True)
 class AlternativeModel:
     """The answer of another model of the same data, and the probability that it is that model which is right."""
 
@@ -148,6 +165,11 @@ class Solution:
         posterior: what further motions would add to (assess/information.py); None for methods that estimate no noise.
         groups: what leaving out groups of neighbouring motions says, flat over trials; None for `paper` and `global`.
         history: cost of accepted iterates of the refinement.
+        frame: what `arm` is: `arm`, the laparoscope's; or `instrument_base` where the set-up is unknown and the
+            laparoscope stands still: the pose of the instrument's base in the camera is then all there is to know.
+        setup: the pose of one arm's base in the other's and the joint covariance, where it was estimated.
+        evidence: chance of what the data say if an unknown that was left out were nominal, by name
+            (estimate/evidence.py); of the first solve.
         information_kept: part of the information (per parameter, geometric mean) that thinning kept; 1 without.
     """
 
@@ -173,6 +195,9 @@ class Solution:
     posterior: Posterior | None = None
     groups: GroupCheck | None = None
     history: tuple[Float[Tensor, "..."], ...] = ()
+    frame: str = "arm"
+    setup: SetupEstimate | None = None
+    evidence: dict[str, Float[Tensor, "*batch"]] = field(default_factory=dict)
     information_kept: float = 1.0
 
     @property
@@ -214,6 +239,11 @@ def map_tensors(value: Any, function: Callable[[Tensor], Tensor]) -> Any:
     return value
 
 
+def take_solved(solution: Solution, index: Int[Tensor, " k"]) -> Solution:
+    """The trials `index` of the only batch axis, in this order; without the history, which all trials share."""
+    return map_tensors(replace(solution, history=()), lambda x: x[index])
+
+
 def concatenate(groups: list[Solution]) -> Solution:
     """The solution of all trials from those of groups of them.
 
@@ -221,9 +251,26 @@ def concatenate(groups: list[Solution]) -> Solution:
     """
     names = dict.fromkeys(name for group in groups for name in group.nuisances)
     nuisances = {name: _joined([_nuisance(name, group, groups) for group in groups]) for name in names}
+    setups = [group.setup for group in groups]
+    if any(setup is not None for setup in setups):
+        setups = [_no_setup(group) if group.setup is None else group.setup for group in groups]
+    evidence = {
+        name: torch.cat([group.evidence.get(name, torch.full_like(group.cheirality, torch.nan)) for group in groups])
+        for name in dict.fromkeys(name for group in groups for name in group.evidence)
+    }
     same = all(group.nuisances.keys() == names.keys() for group in groups)
-    parts = [replace(group, nuisances={}, posterior=group.posterior if same else None) for group in groups]
-    return replace(_joined(parts), nuisances=nuisances)
+    parts = [
+        replace(group, nuisances={}, evidence={}, setup=setup, posterior=group.posterior if same else None)
+        for group, setup in zip(groups, setups, strict=True)
+    ]
+    return replace(_joined(parts), nuisances=nuisances, evidence=evidence)
+
+
+def _no_setup(group: Solution) -> SetupEstimate:
+    """NaN for every trial of a group that has no set-up among its unknowns."""
+    like = group.camera_right_T_arm
+    covariance = like.new_full((len(like), 12, 12), torch.nan)
+    return SetupEstimate(torch.full_like(like, torch.nan), covariance, covariance[:, 0, :6].clone())
 
 
 def _joined(parts: list[Any]) -> Any:

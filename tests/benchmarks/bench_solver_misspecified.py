@@ -1,4 +1,5 @@
-"""Truth and sigma where the model is wrong: without checks, with groups of motions, and with priors on the cameras.
+"""Truth and sigma where the model is wrong: without checks, with groups of motions, with priors on the cameras, and
+with the set-up and compliance freed by evidence.
 
     python tests/benchmarks/bench_solver_misspecified.py [--trials 200] [--motions 96] [--scenes moving still]
 
@@ -25,9 +26,16 @@ from rmis_calib.solver import Problem, solve
 
 FOCAL_PX = 800.0
 POINTS = ("axis_right", "contour_right", "end_right", "axis_left", "contour_left", "end_left")
-BY_MOTION = ("arm_T_rcm", "rcm_v_axis", "rcm_s_end_mm", *POINTS, "valid_right", "valid_left")
+BY_MOTION = (
+    "arm_T_rcm", "laparoscope_base_T_arm", "rcm_v_axis", "rcm_s_end_mm", *POINTS, "valid_right", "valid_left"
+)  # fmt: skip
 CAMERAS = {"sigma_focal": 0.005, "sigma_centre": 3.0 / FOCAL_PX, "sigma_lens": 0.03}
 """Priors of the intrinsics, as `calibrate` has them."""
+CHAINS = ("laparoscope_base_T_arm", "laparoscope_base_T_instrument_base")
+MODES = (("before", 0, {}, False), ("groups", 8, {}, False), ("cameras", 8, CAMERAS, False))
+MODES = (*MODES, ("evidence", 8, CAMERAS, True))
+"""Name, groups that are left out, priors of the cameras, and whether the set-up and what the arm gives way are freed by
+evidence."""
 INSIDE_95, BEYOND_3_SIGMA = 12.592, 20.14
 """Quantiles of chi-square with 6 degrees of freedom: 0.95, and the 3-sigma bound 4.49^2."""
 
@@ -124,17 +132,23 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=200)
     parser.add_argument("--motions", type=int, default=125)
     parser.add_argument("--scenes", nargs="+", default=["moving", "still"], choices=["moving", "still"])
+    parser.add_argument("--modes", nargs="+", default=[mode[0] for mode in MODES])
+    parser.add_argument("--errors", nargs="+", default=list(ERRORS), choices=list(ERRORS))
     arguments = parser.parse_args()
     print(f"{'scene':8} {'error':24} {'mode':7} {'in 95 %':>8} {'ok, wrong':>9} {'called ok':>9}  median sigma, error")
     for name in arguments.scenes:
-        for what, change in ERRORS.items():
+        for what in arguments.errors:
             generator = np.random.default_rng(0)
-            arrays = change(scene(name, arguments.trials, arguments.motions, 0.3), generator)
+            arrays = ERRORS[what](scene(name, arguments.trials, arguments.motions, 0.3), generator)
             truth = torch.as_tensor(arrays["truth"]["camera_right_T_arm"])
             keys = {key: value for key, value in arrays.items() if key != "truth" and "head" not in key}
-            for mode, groups, known in (("before", 0, {}), ("groups", 8, {}), ("cameras", 8, CAMERAS)):
-                problem = Problem.from_arrays(keys | known).only("axis", "contours", "ends")
-                found = solve(problem, parse_config({"solver": {"groups": groups}}).solver)
+            for mode, groups, known, evidence in MODES:
+                if mode not in arguments.modes:
+                    continue
+                given = {key: value for key, value in keys.items() if evidence or key not in CHAINS}
+                problem = Problem.from_arrays(given | known).only("axis", "contours", "ends")
+                asked = {"groups": groups, "unknowns": {"compliance": "auto" if evidence else "never"}}
+                found = solve(problem, parse_config({"solver": asked}).solver)
                 T = found.camera_right_T_arm
                 gap = torch.cat(
                     (matrix_to_rotvec(truth[:, :3, :3] @ T[:, :3, :3].mT), truth[:, :3, 3] - T[:, :3, 3]), dim=-1

@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from rmis_calib.geometry.rigid import rigid_from_rotation_translation
+from rmis_calib.geometry.rigid import rigid_exp, rigid_from_rotation_translation, rigid_inverse, rigid_log
 from rmis_calib.geometry.rotations import matrix_to_rotvec
 from rmis_calib.solver.assess.groups import check_groups
-from rmis_calib.solver.assess.observability import assess, detect_degeneracies
+from rmis_calib.solver.assess.observability import assess, detect_degeneracies, turns_about_one_axis
 from rmis_calib.solver.estimate.map_estimate import MapEstimate
 from rmis_calib.solver.estimate.multistart import cheirality
 from rmis_calib.solver.estimate.noise_levels import COMPONENTS, assumed_noise
@@ -23,7 +23,7 @@ from rmis_calib.solver.model.state import State
 from rmis_calib.solver.observability import Degeneracy, ObservabilityTensors, Verdict
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import Method, SolverSettings
-from rmis_calib.solver.solution import AlternativeModel, Nuisance, Posterior, Solution
+from rmis_calib.solver.solution import AlternativeModel, GroupCheck, Nuisance, Posterior, SetupEstimate, Solution
 from rmis_calib.solver.start.candidates import COLLAPSED_MM, collapsed
 from rmis_calib.solver.status import MotionReason, SolveStatus
 
@@ -110,6 +110,7 @@ def joint_solution(fit: MapEstimate, settings: SolverSettings, alternative: Alte
     C = C * excess.clamp_min(1.0)[:, None, None]  # too small noise levels would make sigma too small (Birge 1932)
     groups = check_groups(fit, settings.groups)
     C = groups.grown(C)
+    setup = _setup(fit, excess, groups)
     if alternative is not None:
         C = _mixed(C, state.R, state.t, alternative)
     distance = (fit.distance2 / measured.rows_ok.sum(0).clamp_min(1)).sqrt()
@@ -131,6 +132,7 @@ def joint_solution(fit: MapEstimate, settings: SolverSettings, alternative: Alte
         nuisances=_nuisances(fit, settings),
         bias=fit.bias[:, :6],
         groups=groups,
+        setup=setup,
         history=fit.history,
         observability=_observability(fit.problem, state.R, state.t, C, fit.model.noise, uses, settings),
         posterior=_posterior(fit, excess.clamp_min(1.0)),
@@ -163,6 +165,29 @@ def joint_on_graph(solution: Solution, problem: Problem, fit: MapEstimate, setti
     )
 
 
+def _setup(fit: MapEstimate, excess: Float[Tensor, " b"], groups: GroupCheck) -> SetupEstimate | None:
+    """The set-up that was estimated, and the joint covariance, grown like that of the transform."""
+    part, at = fit.model.layout.blocks.get("setup"), fit.problem.laparoscope_base_T_instrument_base
+    if part is None or at is None:
+        return None
+    b, index = len(excess), [*range(6), *range(part.start, part.stop)]
+    estimate = at @ rigid_exp(fit.state.setup)
+    # From a perturbation on the right, in `instrument_base`, to one on the left.
+    turn = torch.zeros(b, 12, 12, dtype=at.dtype, device=at.device)
+    turn[:, :6, :6] = groups.growth
+    turn[:, 6:9, 6:9] = turn[:, 9:, 9:] = groups.inflation[:, None, None] * estimate[:, :3, :3]
+    covariance = fit.covariance[:, index][:, :, index] * excess.clamp_min(1.0)[:, None, None]
+    stated = fit.problem.setup_stated
+    known = torch.full_like(at, torch.nan) if stated is None else stated
+    is_known = torch.isfinite(known).flatten(1).all(-1)
+    away = rigid_log(rigid_inverse(torch.where(is_known[:, None, None], known, estimate)) @ estimate)
+    return SetupEstimate(
+        laparoscope_base_T_instrument_base=estimate,
+        covariance=turn @ covariance @ turn.mT,
+        from_stated=torch.where(is_known[:, None], away, torch.nan),
+    )
+
+
 def _mixed(
     C: Float[Tensor, "b 6 6"], R: Float[Tensor, "b 3 3"], t: Float[Tensor, "b 3"], alternative: AlternativeModel
 ) -> Float[Tensor, "b 6 6"]:
@@ -175,9 +200,17 @@ def _mixed(
 
 
 def _posterior(fit: MapEstimate, excess: Float[Tensor, " b"]) -> Posterior:
-    """The fit with all variances `excess` times as large."""
+    """The fit with all variances `excess` times as large, without what holds for its own poses alone."""
     noise = NoiseModel(**{name: value * excess for name, value in vars(fit.model.noise).items()})
-    return Posterior(fit.state, fit.model.layout, noise, fit.information / excess[:, None, None])
+    layout, information = fit.model.layout, fit.information
+    if "compliance" in layout.blocks:  # of these poses alone, and the last block: eliminated
+        kept = layout.blocks["compliance"].start
+        blocks = {name: part for name, part in layout.blocks.items() if name != "compliance"}
+        layout = replace(layout, blocks=blocks, sigma=layout.sigma[:, :kept])
+        between = information[:, :kept, kept:]
+        others = torch.linalg.solve(information[:, kept:, kept:], between.mT)
+        information = information[:, :kept, :kept] - between @ others
+    return Posterior(fit.state, layout, noise, information / excess[:, None, None])
 
 
 def _judge(fit: MapEstimate) -> tuple[Int[Tensor, " b"], Int[Tensor, "b n"], Float[Tensor, " b"]]:
@@ -275,6 +308,8 @@ def _observability(
     flags = detect_degeneracies(
         problem, noise.kinematics_mm.sqrt(), noise.kinematics_rad.sqrt(), uses, settings.noise, distance
     )
+    if settings.unknowns.setup != "known" and problem.laparoscope_base_T_arm is not None:
+        flags = flags + Degeneracy.SETUP_AND_TRANSFORM * turns_about_one_axis(problem.laparoscope_base_T_arm)
     return replace(first, degeneracy=flags)
 
 

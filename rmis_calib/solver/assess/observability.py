@@ -7,14 +7,16 @@ singular matrix.
 """
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from rmis_calib.geometry.rotations import skew
+from rmis_calib.geometry.rotations import matrix_to_rotvec, skew
 from rmis_calib.solver.observability import Degeneracy, ObservabilityTensors, Verdict
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import NoiseSettings, VerdictSettings
 
+LEAST_TURN_RAD = 5e-3
+"""Spread of the laparoscope's turns about a second axis below which it turned about one only."""
 NOISE_MARGIN = 3.0
 """A spread below this many sigma of the kinematics' noise counts as no motion."""
 
@@ -112,6 +114,14 @@ def detect_degeneracies(
     if not (ends or heads):
         flags = flags + int(Degeneracy.NO_ALONG_AXIS_CUE)
     return flags
+
+
+def turns_about_one_axis(laparoscope_base_T_arm: Float[Tensor, "b n 4 4"]) -> Bool[Tensor, " b"]:
+    """Whether the laparoscope turned about a single axis at most: the transform and the set-up can then change together
+    without a trace (Tsai & Lenz 1989, of the same equation AX = XB)."""
+    R = laparoscope_base_T_arm[..., :3, :3]
+    turned = matrix_to_rotvec(R[:, :1].mT @ R)
+    return _spread(turned)[:, -2] < LEAST_TURN_RAD
 
 
 def _spread(x: Float[Tensor, "b n 3"]) -> Float[Tensor, "b 3"]:

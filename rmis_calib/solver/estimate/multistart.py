@@ -70,7 +70,7 @@ def multistart(
         R, t = contour_starts(sample, torch.nan_to_num(problem.radius_mm), all_kinds=False)
     else:
         R, t = starts[0][:, :1], starts[1][:, :1]
-    first = _race(problem, sample, R, t, assumed, free, settings, robust=False)
+    first = race(problem, sample, R, t, assumed, free, settings, robust=False)
     state, noise, contaminated = first.state, first.noise, torch.zeros_like(first.settled)
     open_ = torch.nonzero(~first.settled)[:, 0]
     if len(open_):
@@ -92,23 +92,23 @@ def _compete(
     free: dict[str, Tensor],
     settings: SolverSettings,
     starts: tuple[Tensor, Tensor] | None,
-) -> "_Multistart":
+) -> "Race":
     """All starts, and where there are outliers robust ones too; `outliers` says where these were needed."""
     sample = measured.take_motions(order[: settings.start_motions])
     R, t = _starts(problem, measured, settings) if starts is None else starts
-    race = _race(problem, sample, R, t, assumed, free, settings, robust=False)
+    best = race(problem, sample, R, t, assumed, free, settings, robust=False)
     # A poor fit hides outliers where the noise levels are to be estimated: they are raised until it looks good.
-    suspect = race.outliers | (settings.robust == "on") | (_any_free_by_trial(free) & ~race.settled)
+    suspect = best.outliers | (settings.robust == "on") | (_any_free_by_trial(free) & ~best.settled)
     at = torch.nonzero(suspect & (settings.robust != "off"))[:, 0]
-    race = replace(race, outliers=torch.zeros_like(suspect))
+    best = replace(best, outliers=torch.zeros_like(suspect))
     if not len(at):
-        return race
+        return best
     index = order[: ROBUST_SAMPLES * settings.start_motions]
     problem, measured = problem.take_trials(at), measured.take_trials(at)
     assumed, free = assumed.take(at), {name: value[at] for name, value in free.items()}
     sample = measured.take_motions(index)
     candidates = robust_candidates(problem.select_motions(index), settings.grid, COMPETING_MINIMA)
-    state = race.state.take(at)
+    state = best.state.take(at)
     starts_R, starts_t = [state.R[:, None], candidates.R], [state.t[:, None], candidates.t]
     if measured.has_contours:
         R, t = contour_starts(sample, torch.nan_to_num(problem.radius_mm), reweightings=10)
@@ -116,20 +116,22 @@ def _compete(
     if _points_matter(measured):
         R, t = point_starts(sample, settings.grid, COMPETING_MINIMA, reweightings=4)
         starts_R, starts_t = [*starts_R, R], [*starts_t, t]
-    robust = _race(
-        problem, sample, torch.cat(starts_R, 1), torch.cat(starts_t, 1), assumed, free, settings, robust=True
-    )
+    robust = race(problem, sample, torch.cat(starts_R, 1), torch.cat(starts_t, 1), assumed, free, settings, robust=True)
     contaminated = torch.zeros_like(suspect)
     contaminated[at] = True
-    return _Multistart(race.state.put(at, robust.state), race.noise.put(at, robust.noise), contaminated, race.settled)
+    state, noise = best.state.put(at, robust.state), best.noise.put(at, robust.noise)
+    return replace(best, state=state, noise=noise, outliers=contaminated)
 
 
 @dataclass(frozen=True)
-class _Multistart:
-    """Winner of a race of starts, and its noise levels; which trials have outliers, and which need no other start."""
+class Race:
+    """Winner of a race of starts, its noise levels, truncated cost and cheirality; which trials have outliers, and
+    which need no other start."""
 
     state: State
     noise: NoiseModel
+    cost: Float[Tensor, " b"]
+    front: Float[Tensor, " b"]
     outliers: Bool[Tensor, " b"]
     settled: Bool[Tensor, " b"]
 
@@ -156,7 +158,7 @@ def _points_matter(measured: MeasurementRows) -> bool:
     return measured.has_heads or (measured.has_ends and not measured.has_contours)
 
 
-def _race(
+def race(
     problem: Problem,
     sample: MeasurementRows,
     R: Float[Tensor, "b s 3 3"],
@@ -165,7 +167,7 @@ def _race(
     free: dict[str, Tensor],
     settings: SolverSettings,
     robust: bool,
-) -> _Multistart:
+) -> Race:
     """Refines every start on the sample and keeps, per trial, the one of least truncated cost among those in front of
     the camera."""
     b, s = R.shape[:2]
@@ -192,16 +194,17 @@ def _race(
         best = (torch.nan_to_num(cost.view(-1, s), nan=1e29) + torch.where(enough, 0.0, 1e30)).argmin(1)
         flat = best + s * torch.arange(best.shape[0], device=best.device)
         states.append(refined.state.take(flat))
-        kept.append((distance2[:, flat], rows[:, flat], front.flatten()[flat], _sure(refined.normal.H[flat])))
+        least = cost.flatten()[flat]
+        kept.append((distance2[:, flat], rows[:, flat], front.flatten()[flat], _sure(refined.normal.H[flat]), least))
     state = State(**{name: torch.cat([getattr(part, name) for part in states]) for name in vars(states[0])})
     distance2, rows = (torch.cat([part[i] for part in kept], dim=1) for i in (0, 1))
-    front, sure = (torch.cat([part[i] for part in kept]) for i in (2, 3))
+    front, sure, cost = (torch.cat([part[i] for part in kept]) for i in (2, 3, 4))
     noise = _inflated(assumed, free, distance2, rows)
     limit = chi2_quantile(rows, settings.outlier_probability)
     limit = limit * torch.where(_any_free_by_trial(free), _inflation(distance2, rows), 1.0)[:, None]
     outliers = ((distance2 > 2.0 * limit) & (rows > 0)).any(-1).any(0)
     fits = distance2.sum((0, 2)) < SETTLED_FIT * rows.sum((0, 2))
-    return _Multistart(state, noise, outliers, fits & (front > 0.9) & sure & ~outliers)
+    return Race(state, noise, cost, front, outliers, fits & (front > 0.9) & sure & ~outliers)
 
 
 def _sure(H: Float[Tensor, "b p p"]) -> Bool[Tensor, " b"]:

@@ -1,8 +1,9 @@
-"""Joint offsets and the clock: unknowns that act through the kinematics, which the solver does not know.
+"""Joint offsets, the clock and the set-up: unknowns that act through the kinematics.
 
 The caller hands in `kinematics(joint_offset, clock_s)`: the problem with both arms' poses evaluated at these offsets,
 their derivatives with it. The solver estimates increments from the derivatives, has the kinematics evaluated again
-there, and repeats until the increments vanish.
+there, and repeats until the increments vanish. The set-up (the pose of one arm's base in the other's) needs no such
+function: a problem with the laparoscope's own kinematics is put to another one exactly (`Problem.at_setup`).
 
 **Clock start.** Offsets of seconds are far outside of any linearisation. They are found without knowing the
 transform: for every candidate offset the axis lines give a 9x9 Gram matrix and the least rotation cost over all of
@@ -16,14 +17,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rmis_calib.geometry.rigid import rigid_exp
 from rmis_calib.solver.estimate.map_estimate import MapEstimate, map_estimate
+from rmis_calib.solver.estimate.setup_start import at_best_setup
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import SolverSettings
 from rmis_calib.solver.start.candidates import find_candidates
 from rmis_calib.solver.start.line_statistics import LineStatistics
 
-Kinematics = Callable[[Float[Tensor, "b j"], Float[Tensor, " b"]], Problem]
-"""(joint offsets, clock offsets in s) -> problem with that trial axis, `joint_offset_at` and `clock_at` set."""
+Kinematics = Callable[..., Problem]
+"""(joint offsets (b, j), clock offsets in s (b,)) -> problem with that trial axis, `joint_offset_at` and `clock_at`
+set. Where the set-up is an unknown too, the `laparoscope_base_T_instrument_base` to evaluate at is a third argument,
+(b, 4, 4)."""
 
 ROUNDS = 5
 SETTLED_SIGMA = 0.05
@@ -47,22 +52,47 @@ def scan_clock(
     return float(offsets_s[score.argmin()]), score
 
 
-def solve_relinearised(problem: Problem, settings: SolverSettings, kinematics: Kinematics) -> MapEstimate:
-    """Joint estimate with the kinematics evaluated anew at the estimated offsets, until they settle.
+def solve_relinearised(problem: Problem, settings: SolverSettings, kinematics: Kinematics | None) -> MapEstimate:
+    """Joint estimate with the kinematics evaluated anew at the estimated offsets and set-up, until they settle.
 
     Args:
-        problem: one trial axis, at the offsets to start from (`joint_offset_at`, `clock_at`).
-        kinematics: of the same trials.
+        problem: one trial axis, at the offsets and the set-up to start from (`joint_offset_at`, `clock_at`,
+            `laparoscope_base_T_instrument_base`).
+        kinematics: of the same trials; None where the set-up alone is unknown.
     """
     fit = map_estimate(problem, settings)
     for _ in range(ROUNDS - 1):
         if _settled(fit):
             break
-        joint_at = _at(problem.joint_offset_at, fit.state.joint_offset)
-        clock_at = _at(problem.clock_at, fit.state.clock)
-        problem = kinematics(joint_at + fit.state.joint_offset, clock_at + fit.state.clock)
+        joint_offset = _at(problem.joint_offset_at, fit.state.joint_offset) + fit.state.joint_offset
+        clock_s = _at(problem.clock_at, fit.state.clock) + fit.state.clock
+        setup = None
+        if "setup" in fit.model.layout.blocks:
+            setup = problem.chains[1] @ rigid_exp(fit.state.setup)
+        problem = evaluated(problem, kinematics, joint_offset, clock_s, setup)
         fit = map_estimate(problem, settings, fit)
     return fit
+
+
+def evaluated(
+    problem: Problem,
+    kinematics: Kinematics | None,
+    joint_offset: Float[Tensor, "b j"],
+    clock_s: Float[Tensor, " b"],
+    setup: Float[Tensor, "b 4 4"] | None,
+) -> Problem:
+    """The problem at these offsets and this set-up; None: as it is stated."""
+    if kinematics is not None:
+        return kinematics(joint_offset, clock_s) if setup is None else kinematics(joint_offset, clock_s, setup)
+    return problem if setup is None else problem.at_setup(setup)
+
+
+def start_of(problem: Problem, settings: SolverSettings, kinematics: Kinematics | None) -> Problem:
+    """The problem at the set-up to start from, its own offsets kept."""
+    begin = at_best_setup(problem, settings)
+    if kinematics is None or begin is problem or problem.joint_offset_at is None or problem.clock_at is None:
+        return begin
+    return evaluated(begin, kinematics, problem.joint_offset_at, problem.clock_at, begin.chains[1])
 
 
 def _at(value: Tensor | None, like: Tensor) -> Tensor:
@@ -71,7 +101,7 @@ def _at(value: Tensor | None, like: Tensor) -> Tensor:
 
 def _settled(fit: MapEstimate) -> bool:
     sigma = fit.covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
-    for name in ("joint_offset", "clock"):
+    for name in ("joint_offset", "clock", "setup"):
         if name in fit.model.layout.blocks:
             moved = getattr(fit.state, name)
             moved = moved if moved.ndim == 2 else moved[:, None]

@@ -16,7 +16,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from rmis_calib.errors import ShapeError
+from rmis_calib.geometry.rotations import skew
 from rmis_calib.solver.model.batched_linalg import batch_last, rotate
+from rmis_calib.solver.model.compliance import coordinates
 from rmis_calib.solver.own_measurement import Measurement, OwnResidual
 from rmis_calib.solver.problem import CAMERAS, Problem
 from rmis_calib.solver.settings import NoiseSettings
@@ -86,6 +88,9 @@ class MeasurementRows:
         camera_t: its translation.
         joint: displacement of the shaft per unit of joint offset, in `arm`; None where unknown.
         clock: displacement per second, in `arm`.
+        setup: displacement per unit of each component of the set-up's perturbation (`State.setup`), in `arm`; None
+            where the set-up cannot be an unknown.
+        pose: of the instrument, scaled (model/compliance.py).
         own: measurements of the user's own.
         autograd: whether `residuals.linearise` takes the derivatives from autograd.
         exact: whether autograd also differentiates what the analytic derivatives hold (residuals.py): for the
@@ -109,8 +114,10 @@ class MeasurementRows:
     head_ok: Bool[Tensor, "h b n"]
     camera_R: Float[Tensor, "3 3 c b"]
     camera_t: Float[Tensor, "3 c b"]
+    pose: Float[Tensor, "3 b n"]
     joint: Float[Tensor, "6 j b n"] | None = None
     clock: Float[Tensor, "6 b n"] | None = None
+    setup: Float[Tensor, "6 6 b n"] | None = None
     own: tuple[OwnRows, ...] = ()
     autograd: bool = False
     exact: bool = False
@@ -257,8 +264,10 @@ def pack(problem: Problem, noise: NoiseSettings) -> MeasurementRows:
         head_ok=head_ok,
         camera_R=camera[:3, :3],
         camera_t=camera[:3, 3],
+        pose=coordinates(problem),
         joint=joint,
         clock=clock,
+        setup=None if problem.laparoscope_base_T_arm is None else _setup_effects(problem),
         own=tuple(_own(problem, item) for item in problem.own),
     )
 
@@ -299,6 +308,17 @@ def line_points(problem: Problem) -> int:
 def _contour_ok(problem: Problem) -> Bool[Tensor, "b c n"]:
     known = torch.isfinite(problem.contour_xy).all(-1).all(-1).all(-1) & problem.valid
     return known & torch.isfinite(problem.radius_mm)[:, None, None]
+
+
+def _setup_effects(problem: Problem) -> Float[Tensor, "6 6 b n"]:
+    """[displacement, component]: with S <- S (exp(omega), tau), the shaft turns by Q omega and its RCM moves by
+    Q (tau + omega x p), Q = `arm_R_instrument_base` and p the RCM in `instrument_base`."""
+    laparoscope, setup = problem.chains
+    Q = laparoscope[..., :3, :3].mT @ setup[:, None, :3, :3]
+    p = problem.instrument_base_T_rcm[..., :3, 3]
+    turned = torch.cat((Q, -Q @ skew(p)), dim=-2)
+    shifted = torch.cat((torch.zeros_like(Q), Q), dim=-2)
+    return batch_last(torch.cat((turned, shifted), dim=-1), 2)
 
 
 def _to_arm(arm_R_rcm: Tensor, displacement: Tensor) -> Tensor:

@@ -1,5 +1,6 @@
 """Which parameters a joint estimate has, their priors, and their columns of the Jacobian."""
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -7,7 +8,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rmis_calib.errors import InputError
+from rmis_calib.geometry.rigid import rigid_inverse, rigid_log
 from rmis_calib.solver.model.batched_linalg import add_cross_, batch_last, cross, dot, rotate
+from rmis_calib.solver.model.compliance import COUNT, FUNCTIONS, SHIFTS, TURNS, basis
 from rmis_calib.solver.model.measurement_rows import LINE, MeasurementRows, line_points
 from rmis_calib.solver.model.residuals import LinearisedRows, Shaft, intrinsic_effects, rcm_axes
 from rmis_calib.solver.model.state import State
@@ -24,6 +27,8 @@ UNITS = {
     "clock": "s",
     "edge_bias": "focal lengths",
     "intrinsics": "relative, focal lengths, k1",
+    "setup": "rad, mm",
+    "compliance": "rad, mm",
 }
 """Unit of each nuisance block."""
 
@@ -80,6 +85,8 @@ class ParameterLayout:
             "clock": (state.clock - origin.clock)[:, None],
             "edge_bias": (state.edge_bias - origin.edge_bias).flatten(1),
             "intrinsics": (state.intrinsics - origin.intrinsics).flatten(1),
+            "setup": state.setup - origin.setup,
+            "compliance": state.compliance - origin.compliance,
         }
         return torch.cat([deviation[name] for name in self.blocks], dim=-1), self.sigma.square().reciprocal()
 
@@ -97,6 +104,9 @@ class NuisancePriors:
         joint_offset_at, clock_at: where the kinematics were evaluated.
         edge_bias: prior of the shift of each line row; 0 where there is none.
         intrinsics: prior of each camera's corrections; 0 where there is none.
+        setup_at: where the kinematics were evaluated, from the stated set-up (from none: the identity); as
+            `State.setup`.
+        setup_mm, setup_rad: given sigmas of the stated set-up; NaN where unknown.
     """
 
     stereo: Float[Tensor, "b 4 4"]
@@ -108,6 +118,9 @@ class NuisancePriors:
     clock_at: Float[Tensor, " b"]
     edge_bias: Float[Tensor, "b l c"]
     intrinsics: Float[Tensor, "b c 4"]
+    setup_at: Float[Tensor, "b 6"]
+    setup_mm: Float[Tensor, " b"]
+    setup_rad: Float[Tensor, " b"]
 
     @classmethod
     def of(cls, problem: Problem) -> "NuisancePriors":
@@ -126,11 +139,24 @@ class NuisancePriors:
             clock_at=torch.zeros_like(problem.radius_mm) if problem.clock_at is None else problem.clock_at,
             edge_bias=problem.noise.edge_bias[:, None, None].expand(-1, line_points(problem), problem.n_cameras),
             intrinsics=intrinsics[:, None].expand(-1, problem.n_cameras, -1),
+            setup_at=_setup_at(problem),
+            setup_mm=level.setup_mm,
+            setup_rad=level.setup_rad,
         )
 
     def repeat(self, part: slice, times: int) -> "NuisancePriors":
         """Of some trials, each repeated."""
         return NuisancePriors(**{name: value[part].repeat_interleave(times, 0) for name, value in vars(self).items()})
+
+
+def _setup_at(problem: Problem) -> Float[Tensor, "b 6"]:
+    """Where the kinematics were evaluated, from the stated set-up."""
+    at, stated = problem.laparoscope_base_T_instrument_base, problem.setup_stated
+    if at is None or stated is None:
+        return problem.radius_mm.new_zeros(problem.n_trials, 6)
+    known = torch.isfinite(stated).flatten(1).all(-1)[:, None, None]
+    eye = torch.eye(4, dtype=at.dtype, device=at.device)
+    return rigid_log(rigid_inverse(torch.where(known, stated, eye)) @ at)
 
 
 def initial_state(nominal: NuisancePriors, R: Float[Tensor, "b 3 3"], t: Float[Tensor, "b 3"]) -> State:
@@ -148,6 +174,8 @@ def initial_state(nominal: NuisancePriors, R: Float[Tensor, "b 3 3"], t: Float[T
         clock=zero,
         edge_bias=torch.zeros_like(nominal.edge_bias),
         intrinsics=torch.zeros_like(nominal.intrinsics),
+        setup=torch.zeros_like(nominal.setup_at),
+        compliance=zero[:, None].expand(-1, COUNT),
     )
 
 
@@ -180,14 +208,30 @@ def make_layout(
         entries.append(("edge_bias", origin.edge_bias[0].numel(), nominal.edge_bias.flatten(1)))
     if settings.intrinsics:
         entries.append(("intrinsics", origin.intrinsics[0].numel(), nominal.intrinsics.flatten(1)))
+    if settings.setup != "known" and measured.setup is not None:
+        entries.append(("setup", 6, _setup_sigma(nominal, settings)))
+    if settings.compliance == "always":
+        turn, shift = math.radians(settings.compliance_sigma_deg), settings.compliance_sigma_mm
+        each = like.new_tensor([turn] * (TURNS * FUNCTIONS) + [shift] * (SHIFTS * FUNCTIONS))
+        entries.append(("compliance", COUNT, each.expand(b, -1)))
     entries = [entry for entry in entries if bool((entry[2] > 0).any())]
     blocks, sigmas, start = {}, [], 0
     for name, width, sigma in entries:
         blocks[name] = slice(start, start + width)
         sigmas.append(sigma if sigma.ndim == 2 else sigma[:, None].expand(b, width))
         start += width
-    centre = replace(origin, joint_offset=-nominal.joint_offset_at, clock=-nominal.clock_at)
+    centre = replace(origin, joint_offset=-nominal.joint_offset_at, clock=-nominal.clock_at, setup=-nominal.setup_at)
     return ParameterLayout(blocks, torch.cat(sigmas, dim=-1).clamp_min(1e-12), centre)
+
+
+def _setup_sigma(nominal: NuisancePriors, settings: UnknownSettings) -> Float[Tensor, "b 6"]:
+    """Prior of the set-up: rotation, then translation."""
+    if settings.setup == "free":
+        rad, mm = torch.full_like(nominal.setup_rad, torch.inf), torch.full_like(nominal.setup_mm, TRANSLATION_SIGMA_MM)
+    else:
+        rad = torch.nan_to_num(nominal.setup_rad, nan=math.radians(settings.setup_sigma_deg))
+        mm = torch.nan_to_num(nominal.setup_mm, nan=settings.setup_sigma_mm)
+    return torch.stack((rad, rad, rad, mm, mm, mm), dim=-1)
 
 
 def columns(
@@ -259,6 +303,13 @@ def _displaced(name: str, linear: LinearisedRows, measured: MeasurementRows, sta
         return torch.stack([dot(linear.w, rotate(R, e)[:, None]) for e in rcm_axes(measured.R, measured.v)])
     if measured.joint is not None and name == "joint_offset":
         return torch.stack([_effect(linear, R, motion) for motion in measured.joint.unbind(1)])
+    if name == "compliance":
+        axes = [rotate(R, e)[:, None] for e in (*rcm_axes(measured.R, measured.v), measured.v)]
+        turns, shifts = [dot(linear.a, e) for e in axes[:TURNS]], [dot(linear.w, e) for e in axes]
+        effects = torch.stack((*turns, *shifts))
+        return (effects[:, None] * basis(measured.pose)[:, None]).flatten(0, 1)
+    if measured.setup is not None and name == "setup":
+        return torch.stack([_effect(linear, R, motion) for motion in measured.setup.unbind(1)])
     if measured.clock is not None and name == "clock":
         return _effect(linear, R, measured.clock)[None]
     raise InputError(where=name, expected="derivatives of the kinematics", found="none")

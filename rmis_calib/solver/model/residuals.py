@@ -51,6 +51,7 @@ from rmis_calib.errors import InputError
 from rmis_calib.geometry.cameras import corrected_point
 from rmis_calib.geometry.rotations import rotvec_to_matrix
 from rmis_calib.solver.model.batched_linalg import cross, dot, rotate_trials, unit
+from rmis_calib.solver.model.compliance import FUNCTIONS, basis
 from rmis_calib.solver.model.forward_mode import load_forward_mode
 from rmis_calib.solver.model.measurement_rows import MeasurementRows, OwnRows
 from rmis_calib.solver.model.state import State
@@ -153,11 +154,25 @@ def _corrected(measured: MeasurementRows, state: State) -> tuple[Tensor, Tensor,
     if measured.clock is not None and _matters(state.clock):
         moved = measured.clock * state.clock[:, None]
         displacement = moved if displacement is None else displacement + moved
+    if measured.setup is not None and _matters(state.setup):
+        moved = (measured.setup * state.setup.T[:, :, None]).sum(1)
+        displacement = moved if displacement is None else displacement + moved
+    if _matters(state.compliance):
+        moved = _given_way(measured, state)
+        displacement = moved if displacement is None else displacement + moved
     if displacement is not None:
         p = p + displacement[3:]
         v = unit(v + cross(displacement[:3], v))
         head = head + cross(displacement[:3], head)
     return p, v, head, torch.zeros_like(p) if displacement is None else displacement[:3]
+
+
+def _given_way(measured: MeasurementRows, state: State) -> Float[Tensor, "6 b n"]:
+    """Displacement of the shaft by what the arm gives way, in `arm`."""
+    coefficient = state.compliance.unflatten(-1, (-1, FUNCTIONS)).permute(1, 2, 0)[..., None]  # (component, f, b, 1)
+    turn1, turn2, shift1, shift2, along = (coefficient * basis(measured.pose)).sum(1)
+    e1, e2 = rcm_axes(measured.R, measured.v)
+    return torch.cat((turn1 * e1 + turn2 * e2, shift1 * e1 + shift2 * e2 + along * measured.v))
 
 
 def _matters(offset: Tensor) -> bool:

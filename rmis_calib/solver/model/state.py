@@ -25,6 +25,10 @@ class State:
         clock: seconds added to the time at which the joints were read.
         edge_bias: shift across its line that a line row of each camera has in every motion alike, normalised units.
         intrinsics: corrections of each camera, in the order of `cameras.corrected_point`.
+        setup: `laparoscope_base_T_instrument_base` from where the kinematics were evaluated: right perturbation,
+            rotation vector and translation, rad and mm.
+        compliance: coefficients of the shaft's bend and shift with its pose (model/compliance.py), rad and mm: two
+            rotations, then three translations, each with all functions.
     """
 
     R: Float[Tensor, "b 3 3"]
@@ -38,6 +42,8 @@ class State:
     clock: Float[Tensor, " b"]
     edge_bias: Float[Tensor, "b l c"]
     intrinsics: Float[Tensor, "b c 4"]
+    setup: Float[Tensor, "b 6"]
+    compliance: Float[Tensor, "b q"]
 
     def where(self, chosen: Tensor, other: "State") -> "State":
         """This state in the chosen trials, `other` elsewhere."""
@@ -69,9 +75,11 @@ class State:
             changed["stereo_R"] = self.stereo_R @ turned["stereo_rotation"]
         if "stereo_translation" in step:
             changed["stereo_t"] = self.stereo_t + (self.stereo_R @ step["stereo_translation"][..., None])[..., 0]
-        for block, name in (("translation", "t"), ("rcm_offset", "rcm_offset"), ("joint_offset", "joint_offset")):
-            if block in step:
-                changed[name] = getattr(self, name) + step[block]
+        for name in ("rcm_offset", "joint_offset", "setup", "compliance"):
+            if name in step:
+                changed[name] = getattr(self, name) + step[name]
+        if "translation" in step:
+            changed["t"] = self.t + step["translation"]
         for name in ("radius", "end_offset", "clock"):
             if name in step:
                 changed[name] = getattr(self, name) + step[name][:, 0]

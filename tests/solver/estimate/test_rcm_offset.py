@@ -17,10 +17,11 @@ def test_rcm_offset_needs_nothing_but_the_observations(simulate, realistic):
     e2 = torch.linalg.cross(v, e1)
     T = problem.arm_T_rcm.clone()
     T[..., :3, 3] -= (R @ (1.5 * e1 - 1.0 * e2)[..., None])[..., 0]
-    moved = replace(problem, arm_T_rcm=T).only("contours", "ends")
+    moved = replace(problem, arm_T_rcm=T, laparoscope_base_T_arm=None).only("contours", "ends")
     X = torch.as_tensor(truth["camera_right_T_arm"])[:, :3, 3]
-    found = solve(moved, SolverSettings(unknowns=UnknownSettings(rcm_offset=True, radius_sigma_relative=0.0)))
-    ignored = solve(moved, SolverSettings(unknowns=UnknownSettings(radius_sigma_relative=0.0)))
+    alone = {"radius_sigma_relative": 0.0, "compliance": "never"}
+    found = solve(moved, SolverSettings(unknowns=UnknownSettings(rcm_offset=True, **alone)))
+    ignored = solve(moved, SolverSettings(unknowns=UnknownSettings(**alone)))
     offset = found.nuisances["rcm_offset"]
     assert bool(((offset.value - offset.value.new_tensor([1.5, -1.0])).abs() < 4.0 * offset.sigma).all())
     assert not bool(offset.held.any())

@@ -14,7 +14,7 @@ from rmis_calib.solver.model.parameters import NuisancePriors, columns, initial_
 from rmis_calib.solver.model.residuals import linearise, residual_rows
 from rmis_calib.solver.settings import UnknownSettings
 
-EVERYTHING = UnknownSettings(rcm_offset=True, joint_offsets="always", clock=True)
+EVERYTHING = UnknownSettings(rcm_offset=True, joint_offsets="always", clock=True, setup="prior", compliance="always")
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +115,7 @@ def test_jacobian_of_every_unknown_equals_autodiff(scene):
     layout = make_layout(NuisancePriors.of(problem), measured, state, settings.unknowns, settings.noise)
     assert list(layout.blocks) == [
         "rotation", "translation", "stereo_rotation", "stereo_translation", "radius", "end_offset", "rcm_offset",
-        "joint_offset", "clock", "edge_bias", "intrinsics",
+        "joint_offset", "clock", "edge_bias", "intrinsics", "setup", "compliance",
     ]  # fmt: skip
     exact = replace_measurements(measured, state)
     rows, shaft = linearise(exact, state)
