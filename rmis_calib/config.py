@@ -28,10 +28,10 @@ class CalibrationConfig:
     batch_size: int = 8
     """Frames decoded, moved and detected together."""
     every: int = 1
-    """Only every n-th frame is searched: of a slow video, five neighbours say little more than one."""
+    """Process every n-th frame; adjacent frames of a slow video add little."""
     masks: str | None = None
-    """Masks of one's own in place of the search by colour: a folder of pictures in the order of the frames, white on
-    shafts (for stereo two folders below it, `right` and `left`), or a TorchScript (.pt) or ONNX (.onnx) model from
+    """Use your own segmentation masks instead of colour detection: a folder of pictures in the order of the
+    frames, white on shafts (for stereo two folders below it, `right` and `left`), or a TorchScript (.pt) or ONNX (.onnx) model from
     pictures (b, 3, h, w) in [0, 1] to masks (b, h, w), above 0.5 on shafts."""
     mask_labels: tuple[int, ...] | None = None
     """Class numbers of the shaft, where `masks` are pictures of classes (0, 1, 2, ..., as grey values or in a palette):

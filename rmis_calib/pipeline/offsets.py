@@ -120,7 +120,10 @@ def _about_offsets(
         return f"Constant joint offsets cannot be told from the transform here, and are part of it ({hidden})."
     mixed = [name for name, _, _, is_held, share in visible if not is_held and share > MIXED_SHARE]
     seen = ", ".join(f"{name} {_shown(sigma, column)}" for name, column, sigma, is_held, _ in visible if not is_held)
-    note = f"Constant joint offsets are {100.0 * probability:.0f} % probable; the data see them to 1 sigma of {seen}"
+    note = (
+        f"Estimated probability of constant encoder offsets: {100.0 * probability:.0f} %. If present, this recording "
+        f"would measure them to (1 sigma): {seen}"
+    )
     if hidden:
         note += f"; those of {hidden} cannot be told from the transform and are part of it"
     if len(mixed) > 1:

@@ -65,8 +65,8 @@ def look_again(
         gate = association_gate(choice, found, prediction, used)
         doubtful = _doubtful(found, choice)
         searched += int(doubtful.sum())
-        progress(f"looking again, {view.side}", 0, int(doubtful.sum()))
         if bool(doubtful.any()):
+            progress(f"looking again, {view.side}", 0, int(doubtful.sum()))
             view = _searched_near(view, run, doubtful, contour_points(prediction), config, progress)
         again = consistent_choice(view.at(run.poses.frames), prediction, gate)
         views.append(view)
