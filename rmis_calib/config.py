@@ -30,9 +30,9 @@ class CalibrationConfig:
     every: int = 1
     """Process every n-th frame; adjacent frames of a slow video add little."""
     masks: str | None = None
-    """Use your own segmentation masks instead of colour detection: a folder of pictures in the order of the
-    frames, white on shafts (for stereo two folders below it, `right` and `left`), or a TorchScript (.pt) or ONNX (.onnx) model from
-    pictures (b, 3, h, w) in [0, 1] to masks (b, h, w), above 0.5 on shafts."""
+    """Use your own segmentation masks instead of colour detection: a folder of pictures in the order of the frames,
+    white on shafts (for stereo two folders below it, `right` and `left`), or a TorchScript (.pt) or ONNX (.onnx) model
+    from pictures (b, 3, h, w) in [0, 1] to masks (b, h, w), above 0.5 on shafts."""
     mask_labels: tuple[int, ...] | None = None
     """Class numbers of the shaft, where `masks` are pictures of classes (0, 1, 2, ..., as grey values or in a palette):
     all else is background. Without it, white is shaft."""

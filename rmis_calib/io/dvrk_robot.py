@@ -90,15 +90,19 @@ def import_dvrk(
     if system is not None:
         poses = _on_one_base(poses, bases, name, Path(system), ecm is not None, note)
     head = HeadPoint(len(rows), (0.0, 0.0, 0.0))
-    arms = {"instrument": Arm(_base(poses["instrument"]), rows, np.eye(4), _RCM_FRAME, len(arm_rows) + 1, head)}
+    bases_known = all(placed is not None for placed in poses.values())
+    if ecm is not None and not bases_known:
+        poses = dict.fromkeys(poses)
+        note(
+            "where the arms' bases stand is not known: base_T_arm_base is left out, and estimated where the "
+            "laparoscope moves; fill it in, or give --system, if you know it"
+        )
+    alone = np.eye(4) if ecm is None else None  # one arm's base is as good a base as any
+    base = {arm: alone if placed is None else placed[1] for arm, placed in poses.items()}
+    arms = {"instrument": Arm(base["instrument"], rows, np.eye(4), _RCM_FRAME, len(arm_rows) + 1, head)}
     if ecm is not None:
         ecm_rows = _joints(_kinematics(Path(ecm)), Path(ecm))
-        arms = {"laparoscope": Arm(_base(poses["laparoscope"]), ecm_rows, end_T_scope(endoscope))} | arms
-        if poses["instrument"] is None or poses["laparoscope"] is None:
-            note(
-                "where the arms' bases are is not known: base_T_arm_base is the identity for both, which is wrong; "
-                "fill it in, or give --system"
-            )
+        arms = {"laparoscope": Arm(base["laparoscope"], ecm_rows, end_T_scope(endoscope))} | arms
     return Robot(f"dvrk {Path(instrument).stem} {Path(tool).stem}", "modified", arms)
 
 
@@ -227,7 +231,3 @@ def _on_one_base(
         note(f"{path}: the two arms' bases refer to different frames ({frames}) and were not used")
         return dict.fromkeys(poses)
     return poses
-
-
-def _base(placed: tuple[str, np.ndarray] | None) -> np.ndarray:
-    return np.eye(4) if placed is None else placed[1]

@@ -175,9 +175,10 @@ def test_bases_in_different_frames_are_not_used(tmp_path: Path) -> None:
     system = {"arms": [{"name": n, "base_frame": f} for n, f in zip(("PSM2", "ECM"), frames, strict=True)]}
     paths = dvrk_files(tmp_path, system)
     notes: list[str] = []
-    import_dvrk(paths["arm"], paths["tool"], paths["ecm"], paths["system"], note=notes.append)
+    robot = import_dvrk(paths["arm"], paths["tool"], paths["ecm"], paths["system"], note=notes.append)
     assert any("different frames (left_camera and cart)" in note for note in notes)
-    assert any("base_T_arm_base is the identity for both, which is wrong" in note for note in notes)
+    assert any("base_T_arm_base is left out" in note for note in notes)
+    assert all(arm.base_T_arm_base is None for arm in robot.arms.values())
 
 
 def test_registrations_with_and_without_braces(shared_data: Path, tmp_path: Path) -> None:
