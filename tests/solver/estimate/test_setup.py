@@ -173,7 +173,7 @@ def test_turns_about_one_axis_do_not_tell_the_transform_from_the_set_up(simulate
     solution = solve(one, unknown("free"))
     assert int(solution.verdict) == 2
     assert int(solution.observability.degeneracy) & Degeneracy.SETUP_AND_TRANSFORM
-    assert "two axes" in solution.observability.describe().sentence
+    assert "two axes" in solution.observability.describe().sentences[0]
 
 
 def test_what_the_set_up_cannot_be_found_from(simulate, realistic):
