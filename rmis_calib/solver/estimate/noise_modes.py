@@ -30,6 +30,8 @@ SAMPLE_MOTIONS = 512
 NOISE_ROUNDS = 2
 RIVALS = (0.1, 3.0)
 """Kinematic noise, times the assumed one, that rivals set out from."""
+CLEARLY = 2.0
+"""Gain in the log posterior from which a rival is another mode, and not the same one settled a little differently."""
 USUAL = 1.0
 """Distance of a level from the assumed one, in sigmas of its prior, up to which no rival is tried."""
 
@@ -70,10 +72,10 @@ def settle_noise(
         levels = _with_kinematics(part.noise, own, own_free, factor)
         rival_state, rival = _settle(replace(part, noise=levels), start, mixed, own, own_free, settings)
         value = _log_posterior(replace(part, noise=rival), rival_state, mixed, own, own_free, settings)
-        better = torch.nonzero(value > best)[:, 0]
+        better = torch.nonzero(value > best + CLEARLY)[:, 0]
         best_state = best_state.put(better, rival_state.take(better))
         best_noise = best_noise.put(better, rival.take(better))
-        best = torch.maximum(value.nan_to_num(nan=-torch.inf), best)
+        best = torch.where(value > best + CLEARLY, value, best)
     return settled.put(at, best_state), noise.put(at, best_noise)
 
 
