@@ -180,6 +180,10 @@ class Problem:
         turned = torch.cat((after[..., :3, :3].mT @ turn, after[..., :3, :3].mT @ shift), dim=-2)
         return replace(moved, joint_derivative=torch.cat((turned, others), dim=-1))
 
+    def with_exact_setup(self) -> "Problem":
+        """The problem without the laparoscope's own kinematics: its set-up is exact, and no data speak against it."""
+        return replace(self, laparoscope_base_T_arm=None, laparoscope_base_T_instrument_base=None, setup_stated=None)
+
     def in_instrument_base(self) -> "Problem":
         """The problem with the instrument's base in the place of `arm`: what remains where the laparoscope stands still
         and nobody knows where the instrument's base is. Offsets of joints cannot be told then."""

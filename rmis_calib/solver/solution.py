@@ -258,7 +258,7 @@ def concatenate(groups: list[Solution]) -> Solution:
         name: torch.cat([group.evidence.get(name, torch.full_like(group.cheirality, torch.nan)) for group in groups])
         for name in dict.fromkeys(name for group in groups for name in group.evidence)
     }
-    same = all(group.nuisances.keys() == names.keys() for group in groups)
+    same = all(group.nuisances.keys() == names.keys() and group.posterior is not None for group in groups)
     parts = [
         replace(group, nuisances={}, evidence={}, setup=setup, posterior=group.posterior if same else None)
         for group, setup in zip(groups, setups, strict=True)

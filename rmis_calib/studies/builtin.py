@@ -4,8 +4,9 @@ from rmis_calib.solver import Problem, Solution, SolverSettings, solve
 from rmis_calib.solver.settings import UnknownSettings
 from rmis_calib.studies.registry import method, noise_source
 
-SETTINGS = SolverSettings(unknowns=UnknownSettings(radius_sigma_relative=0.0), groups=0)
-"""The simulated radius is exact. Groups of motions only make sigma grow; they do not move the answer."""
+SETTINGS = SolverSettings(unknowns=UnknownSettings(radius_sigma_relative=0.0, compliance="never"), groups=0)
+"""The simulated radius is exact, and the arms are stiff. Groups of motions only make sigma grow; they do not move the
+answer."""
 
 
 @method("paper", "paper (Algorithm 1)")

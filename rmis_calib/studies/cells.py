@@ -181,7 +181,7 @@ def solve_trials(method: Method, trials: "Trials", cameras: int) -> Columns:
     n = len(trials.truth)
     status, sigma_deg, sigma_mm = ["answered"] * n, [float("nan")] * n, [float("nan")] * n
     try:
-        found = method.solve(trials.problem.only(*method.measurements).cameras(cameras))
+        found = method.solve(trials.problem.with_exact_setup().only(*method.measurements).cameras(cameras))
         estimate = found.camera_right_T_arm if isinstance(found, Solution) else torch.as_tensor(found).double()
         if estimate.shape != trials.truth.shape:
             raise ValueError(f"expected transforms {tuple(trials.truth.shape)}, found {tuple(estimate.shape)}")

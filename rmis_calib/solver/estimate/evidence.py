@@ -48,7 +48,7 @@ def chances(fit: MapEstimate, settings: SolverSettings) -> dict[str, Float[Tenso
             model = model.take_motions(torch.arange(0, model.measured.motions, step, device=fit.state.t.device))
         normal = accumulate(model, fit.state)
         found[name] = _chance(normal.H, normal.g, layout.sigma, layout.blocks[name])
-        if settings.bias_correction and bool((found[name] < CHANCE[name]).any()):
+        if bool((found[name] < CHANCE[name]).any()):
             # Noise in the Jacobian alone makes a score.
             expected = expected_score(model, fit.state, settings.bias_motions, settings.seed)
             found[name] = _chance(normal.H, normal.g - expected.g, layout.sigma, layout.blocks[name])
