@@ -32,7 +32,6 @@ from rmis_calib.pipeline.offsets import estimate_with_kinematics
 from rmis_calib.pipeline.poses import MotionPoses, frame_of, motion_poses
 from rmis_calib.pipeline.result import insufficient_data, make_result, motions_of, residual_of, residuals_px
 from rmis_calib.pipeline.run import CalibrationRun
-from rmis_calib.pipeline.second_look import look_again
 from rmis_calib.results import CalibrationResult
 from rmis_calib.solver.problem import stands_still
 from rmis_calib.vision.masks import Segmenter
@@ -83,8 +82,7 @@ def run_calibration(
     prior = read_prior(config)
     recording, poses = _without_unknown_arm(recording, motion_poses(recording, config.device))
     views, notes = _detect(recording, config, poses, progress, segment)
-    searchable = segment is None and config.masks is None
-    return calibrate_views(recording, config, poses, views, prior, notes, progress, second_look=searchable)
+    return calibrate_views(recording, config, poses, views, prior, notes, progress)
 
 
 def calibrate_views(
@@ -95,7 +93,6 @@ def calibrate_views(
     prior: RigidTransform | None = None,
     notes: tuple[str, ...] = (),
     progress: Progress = no_progress,
-    second_look: bool = False,
 ) -> CalibrationRun:
     """The calibration from shafts that are detected already.
 
@@ -107,7 +104,6 @@ def calibrate_views(
         prior: from `read_prior`.
         notes: on what was detected.
         progress: called with (stage, done, total).
-        second_look: search pictures again in which a first answer expects a shaft and none that is sure was found.
     """
     attempts, several = associate(recording, config, poses, views, prior)
     checked = (*about_motions(recording, poses, config), *about_order(recording, poses, views, attempts[0]))
@@ -115,8 +111,6 @@ def calibrate_views(
     draft = _without_joint_offsets(config)
     run = solve_choices(recording, draft, views, poses, attempts, progress)
     run = _choose_again(run, draft, several, progress)
-    if second_look:
-        run = _look_again(run, draft, progress)
     run = _with_joint_offsets(run, config, progress)
     progress("checking", 0, 1)
     run = with_misfit_named(run, config, lambda: _with_cameras_as_given(run, config))
@@ -212,15 +206,10 @@ def _better_choices(run: CalibrationRun, several: bool) -> tuple[Choice, ...] | 
     return tuple(better)
 
 
-def _look_again(run: CalibrationRun, config: CalibrationConfig, progress: Progress) -> CalibrationRun:
-    """The run with what a second look finds where the first answer expects it; as it was where that gains nothing."""
-    again = look_again(run, config, progress)
-    if again is None or all(new.same_as(old) for new, old in zip(again[1], run.choices, strict=True)):
-        return run
-    views, choices = again
-    better = _solve(run.recording, config, views, run.poses, choices, progress, run.clock_s)
-    told = better.result.status in ("ok", "weak")
-    return better if told and better.result.motions.used.sum() >= run.result.motions.used.sum() else run
+def _as_told(recording: Recording, poses: MotionPoses) -> MotionPoses:
+    """The same motions without anything that a calibration found."""
+    told = motion_poses(recording, str(poses.arm_T_rcm.device))
+    return told.select(torch.as_tensor(np.isin(told.frames, poses.frames), device=told.arm_T_rcm.device))
 
 
 def _with_joint_offsets(run: CalibrationRun, config: CalibrationConfig, progress: Progress) -> CalibrationRun:
@@ -246,7 +235,12 @@ def _solve(
     progress: Progress,
     clock_s: float | None = None,
 ) -> CalibrationRun:
-    """Assemble the chosen candidates, solve, and say what came out; `clock_s` saves the search for the clock."""
+    """Assemble the chosen candidates, solve, and say what came out; `clock_s` saves the search for the clock.
+
+    Every solve sets out from the kinematics as the recording tells them: a run's poses are at what it found, which must
+    not be taken for what is stated.
+    """
+    poses = _as_told(recording, poses)
 
     def refused(why: str, observations: ShaftObservations | None) -> CalibrationRun:
         result = insufficient_data(config, motions_of(recording, views, poses, choices, None), why)

@@ -27,6 +27,7 @@ from rmis_calib.pipeline.observations import problem_of
 from rmis_calib.pipeline.offset_unknowns import KinematicUnknowns
 from rmis_calib.pipeline.poses import MotionPoses, motion_poses
 from rmis_calib.pipeline.run import CalibrationRun
+from rmis_calib.solver import SolveStatus
 from rmis_calib.solver.assess.information import inverse
 from rmis_calib.solver.assess.next_motion import measured_alike, predicted_information
 from rmis_calib.solver.assess.observability import assess
@@ -159,7 +160,13 @@ def _rough(
     known = torch.as_tensor(np.isin(poses.frames, looked), device=poses.arm_T_rcm.device)
     few = poses.select(known)
     attempts, _ = associate(recording, config, few, views, read_prior(config))
-    return solve_choices(recording, quick(config), views, few, attempts, no_progress)
+    rough = quick(config)
+    run = solve_choices(recording, rough, views, few, attempts, no_progress)
+    if run.solution is None or SolveStatus(int(run.solution.status)) is not SolveStatus.MISFIT:
+        return run
+    # A robot less exact than assumed is no misfit: its noise is then estimated, as `calibrate` does.
+    rough = replace(rough, solver=replace(rough.solver, noise=config.solver.noise))
+    return solve_choices(recording, rough, views, few, attempts, no_progress)
 
 
 def quick(config: CalibrationConfig) -> CalibrationConfig:

@@ -22,7 +22,7 @@ class CalibrationRun:
         result: the answer.
         recording: what was calibrated.
         views: frames and detections of each camera.
-        poses: kinematics of the motions.
+        poses: kinematics of the motions at the offsets and the set-up that were found; what `result` goes with.
         choices: candidate taken in each view.
         observations: what the solver saw.
         solution: what the solver returned; None when there were too few motions to solve.

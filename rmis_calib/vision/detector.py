@@ -54,22 +54,6 @@ class ShaftDetector:
         self.segment = segment
         self._canvases: dict[tuple[tuple[int, int], torch.device], Canvas] = {}
 
-    def detect_near(self, images: Tensor, contours: Float[Tensor, "b 2 2 2"]) -> ShaftDetections:
-        """Shafts of each picture, looked for in both views, and where one is expected.
-
-        What lies there is measured and judged like everything else: an expectation adds candidates and no confidence.
-
-        Args:
-            images: as in `detect`.
-            contours: two points [edge, point, xy] of either contour of the expected shaft, both edges running the same
-                way; normalised undistorted coordinates. NaN for none.
-
-        Raises:
-            ShapeError: as in `detect`.
-        """
-        images, _, broken = self._prepared(images, None)
-        return self._look(images, None, broken, 2, self.lens.to_pixels(contours.to(torch.float32)))[0]
-
     def detect(self, images: Tensor, masks: Tensor | None = None) -> ShaftDetections:
         """Shafts of each picture.
 
@@ -117,16 +101,11 @@ class ShaftDetector:
         return images, None if masks is None else checked_masks(masks, images), broken
 
     def _look(
-        self,
-        images: Tensor,
-        masks: Tensor | None,
-        broken: Bool[Tensor, " b"],
-        views: int,
-        guesses: Float[Tensor, "b 2 2 2"] | None = None,
+        self, images: Tensor, masks: Tensor | None, broken: Bool[Tensor, " b"], views: int
     ) -> tuple[ShaftDetections, SearchTrace]:
         """Search in one view or two, and sub-pixel measurement."""
         with torch.inference_mode():
-            found, stages = search(images, self._canvas(images), self.settings, views, masks, guesses)
+            found, stages = search(images, self._canvas(images), self.settings, views, masks)
             measured = self._measure(images, found, stages, broken)
         # Copied out of inference mode, whose tensors no gradient may be taken with respect to.
         return ShaftDetections(**{name: value.clone() for name, value in vars(measured).items()}), stages

@@ -22,6 +22,7 @@ from rmis_calib.pipeline.association import (
     read_prior,
 )
 from rmis_calib.pipeline.calibration import run_calibration
+from rmis_calib.pipeline.poses import motion_poses
 from rmis_calib.vision import ShaftDetections
 
 RADIUS_MM = 4.0
@@ -194,6 +195,8 @@ def test_the_instrument_that_moves_with_the_joints_is_the_one_that_calibrates(tm
     angle_deg = np.rad2deg(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
     assert run.result.status in ("ok", "weak")
     assert angle_deg < 1.0  # measured: 0.41
+    # Rendered head points, unseen by the solver. 88 px: a set-up that was found was then taken for the stated one.
+    assert run.result.head_point_error_px["right"].median < 6.0  # measured: 3.0
     # The surest candidates of a fifth of the pictures are the other instrument's.
     assert run.result.motions.used.sum() > 25
     check_what_is_known_beforehand(recording, run, config, folder)
@@ -201,13 +204,14 @@ def test_the_instrument_that_moves_with_the_joints_is_the_one_that_calibrates(tm
 
 def check_what_is_known_beforehand(recording, run, config, folder):
     """A prior and a pointing user lead to the candidates that the joints led to."""
-    found = tuple(view.at(run.poses.frames) for view in run.views)
+    poses = motion_poses(recording)  # as told: the run's are at the set-up that it found
+    found = tuple(view.at(poses.frames) for view in run.views)
     instruments = choices_by_instrument(found)
     assert len(instruments) >= 2
 
     def start(**known):
         told = replace(config, **known)
-        (choices,) = first_choices(recording, told, run.poses, found, instruments, read_prior(told))
+        (choices,) = first_choices(recording, told, poses, found, instruments, read_prior(told))
         return choices[0].candidate
 
     own = run.choices[0].candidate

@@ -14,8 +14,27 @@ from rmis_calib.vision.coarse.strips import Strips
 from rmis_calib.vision.image.canvas import Canvas
 
 
+def strips_through(contours: torch.Tensor, centre: torch.Tensor) -> Strips:
+    """Strips between two lines each, given by points (b, k, line, point, uv) that run the same way, ideal pixels."""
+    points, valid = contours, torch.ones(contours.shape[:2], dtype=torch.bool)
+    middle = points.mean(2)
+    along = torch.nn.functional.normalize(middle[:, :, 1] - middle[:, :, 0], dim=-1)
+    left = torch.stack([along[..., 1], -along[..., 0]], -1)
+    reach = ((centre - middle[:, :, 0]) * along).sum(-1, keepdim=True)
+    origin = middle[:, :, 0] + reach * along
+    relative = points - origin[:, :, None, None]
+    t, y = ((relative * axis[:, :, None, None]).sum(-1) for axis in (along, left))  # (b, k, line, point)
+    run = t[..., 1] - t[..., 0]
+    slope = (y[..., 1] - y[..., 0]) / torch.where(run.abs() < 1e-3, 1e-3, run)
+    offset = y[..., 0] - slope * t[..., 0]
+    swapped = offset[..., :1] < offset[..., 1:]
+    offset, slope = (torch.where(swapped, value.flip(-1), value) for value in (offset, slope))
+    frame = torch.arange(len(points), device=points.device)[:, None].expand_as(valid)
+    return Strips(frame, origin, along, offset, slope, valid)
+
+
 def strip(points: list[list[list[float]]], centre: tuple[float, float]) -> Strips:
-    return Strips.through(torch.tensor(points)[None, None], torch.tensor(centre))
+    return strips_through(torch.tensor(points)[None, None], torch.tensor(centre))
 
 
 def test_the_straight_picture_shows_what_lies_there():
@@ -98,7 +117,7 @@ def test_true_shafts_look_like_shafts_and_the_same_strip_elsewhere_does_not():
     centre = torch.tensor(canvas.centre)
     turned = [(centre + (c - centre).flip(-1) * torch.tensor([1.0, -1.0])).clone() for _, c in shafts]
     lines = torch.stack([torch.stack([c for _, c in shafts]), torch.stack(turned)])  # (2, m, edge, point, uv)
-    several = Strips.through(lines, centre)
+    several = strips_through(lines, centre)
     number = torch.tensor([i for i, _ in shafts]).expand(2, -1)
     straight, chord = straighten_pictures(stages.rgb, stages.seen.float(), canvas, several, number)
     logit = load_network(torch.device("cpu")).judge(straight, chord.flatten(0, 1)).shaft.unflatten(0, (2, -1))

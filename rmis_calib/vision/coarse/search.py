@@ -29,8 +29,6 @@ _PART_OF_LIT, _SHADOWED = 0.6, (1.1, 1.6)
 _PART_MERIT = 0.5
 # A ridge below this is texture: 4 per cent of brightness a small pixel.
 _MIN_GRADIENT = 0.04
-# Where a shaft is looked for about the place at which it is expected: shares of its width across, rad.
-_AROUND = [(0.3 * i, 0.015 * j) for i in range(-2, 3) for j in range(-1, 2)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +76,6 @@ def search(
     settings: DetectorSettings,
     looks: int,
     masks: Tensor | None = None,
-    guesses: Float[Tensor, "b 2 2 2"] | None = None,
 ) -> tuple[StripCandidates, SearchTrace]:
     """The best strips of each frame, at most `max_shafts`, with their contours traced, and the stages that led there.
 
@@ -88,8 +85,6 @@ def search(
         settings: limits of width, contrast, convergence.
         looks: views of each picture that are searched, 1 or 2 (appearance.py); masks are a single one.
         masks: (b, H, W), 1 on shafts, which replace the colour stage.
-        guesses: two points of either contour of a shaft that is expected, ideal pixels; NaN for none. What lies there
-            is looked at beside what the search finds, and judged in the same way.
     """
     small = shrink(images, canvas.factor)
     field, within = appearance.field_of_view(small, settings.black_level, _RIM_PX)
@@ -114,8 +109,6 @@ def search(
     # Masks have no texture: a strip that is too wide looks as good at a glance as the right one, so none is left out.
     count_pairs = _STRIPS if masks is None else _PAIRS
     pairs = scoring.screen(picture, strips.pair(lines, picture, settings, _PAIRS), settings, count_pairs)
-    if guesses is not None:
-        pairs = pairs.together(_expected(guesses, canvas, count))
     evidence = scoring.inspect(picture, pairs, settings)
     scores = scoring.score(evidence, settings)
     look = partial(_look_along, rgb, seen, picture)
@@ -125,14 +118,6 @@ def search(
     evidence, scores = evidence.views_together(count), scores.unflatten(0, (-1, count)).flatten(1, 2)
     pictures = (rgb, seen, views[:, 0], views[:, -1], ridge, votes)
     return found, SearchTrace(*pictures, lines, evidence, scores, found.scores, canvas.factor, canvas.origin)
-
-
-def _expected(guesses: Float[Tensor, "b 2 2 2"], canvas: Canvas, views: int) -> strips.Strips:
-    """Strips about the expected one, in each view of each picture."""
-    shift, turn = (torch.tensor(values, device=guesses.device) for values in zip(*_AROUND, strict=True))
-    centre = guesses.new_tensor(canvas.centre)
-    through = strips.Strips.through(guesses[:, None].repeat_interleave(views, 0), centre)
-    return through.around(shift.to(guesses.dtype), turn.to(guesses.dtype))
 
 
 def _look_along(

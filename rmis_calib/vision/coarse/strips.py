@@ -105,54 +105,6 @@ class Strips:
             + y[..., None] * self.left.reshape(shape)
         )
 
-    @classmethod
-    def through(cls, contours: Float[Tensor, "b k 2 2 2"], centre: Float[Tensor, " 2"]) -> "Strips":
-        """Strips between two lines each, given by two points [line, point, uv] that run the same way.
-
-        Args:
-            contours: ideal pixels; NaN for none.
-            centre: of the picture.
-        """
-        valid = torch.isfinite(contours).flatten(2).all(-1)
-        points = torch.nan_to_num(contours)
-        middle = points.mean(2)
-        along = torch.nn.functional.normalize(middle[:, :, 1] - middle[:, :, 0], dim=-1)
-        left = torch.stack([along[..., 1], -along[..., 0]], -1)
-        reach = ((centre - middle[:, :, 0]) * along).sum(-1, keepdim=True)
-        origin = middle[:, :, 0] + reach * along
-        relative = points - origin[:, :, None, None]
-        t, y = ((relative * axis[:, :, None, None]).sum(-1) for axis in (along, left))  # (b, k, line, point)
-        run = t[..., 1] - t[..., 0]
-        slope = (y[..., 1] - y[..., 0]) / torch.where(run.abs() < 1e-3, 1e-3, run)
-        offset = y[..., 0] - slope * t[..., 0]
-        swapped = offset[..., :1] < offset[..., 1:]
-        offset, slope = (torch.where(swapped, value.flip(-1), value) for value in (offset, slope))
-        frame = torch.arange(len(points), device=points.device)[:, None].expand_as(valid)
-        return cls(frame, origin, along, offset, slope, valid)
-
-    def together(self, others: "Strips") -> "Strips":
-        """These strips and others of the same frames."""
-        both = {f.name: torch.cat([getattr(self, f.name), getattr(others, f.name)], 1) for f in fields(self)}
-        return Strips(**both)
-
-    def around(self, shifts: Float[Tensor, " s"], turns_rad: Float[Tensor, " s"]) -> "Strips":
-        """s copies of every strip: moved across by shares of its width, and turned."""
-        width = self.offset[..., 0] - self.offset[..., 1]
-        moved = self.offset[:, :, None] + (width[..., None] * shifts)[..., None]
-        slope = self.slope[:, :, None] + turns_rad.tan()[:, None]
-
-        def copies(value: Tensor) -> Tensor:
-            return value[:, :, None].expand(*value.shape[:2], len(shifts), *value.shape[2:]).flatten(1, 2)
-
-        return Strips(
-            frame=copies(self.frame),
-            origin=copies(self.origin),
-            along=copies(self.along),
-            offset=moved.flatten(1, 2),
-            slope=slope.flatten(1, 2),
-            valid=copies(self.valid),
-        )
-
     def pick(self, index: Tensor) -> "Strips":
         """The strips with these indices, (b, k') int64."""
         wide = index[..., None].expand(*index.shape, 2)

@@ -49,11 +49,6 @@ class Lens:
         focal, centre = self._intrinsics(ideal)
         return (ideal - centre) / focal
 
-    def to_pixels(self, xy: Float[Tensor, "*points 2"]) -> Float[Tensor, "*points 2"]:
-        """Normalised undistorted coordinates to ideal pixels."""
-        focal, centre = self._intrinsics(xy)
-        return xy * focal + centre
-
     def to_raw(self, ideal: Float[Tensor, "*points 2"]) -> Float[Tensor, "*points 2"]:
         """Ideal pixels to raw pixels."""
         if self.camera is None or not self.distorts:
