@@ -86,12 +86,13 @@ def main() -> None:
             print(f"{folder.name:22} {result.status:17} {used:>7}  {result.message}", flush=True)
             continue
         degrees, mm, M = gap(result, folder)
-        groups = result.consistency or {"inflation": 1.0, "halves": {"sigmas": float("nan")}}
+        groups = result.consistency
+        grown, halves = (groups.inflation, groups.halves.sigmas) if groups else (1.0, float("nan"))
         print(
             f"{folder.name:22} {result.status:17} {used:>7}  "
             f"{result.rotation_sigma_deg or 0:5.2f} deg {result.translation_sigma_mm or 0:4.1f} mm  "
             f"{degrees:5.2f} deg {mm:5.1f} mm {M:5.2f}  {residual(result, 'contour'):14} {residual(result, 'end'):10} "
-            f"{groups['inflation']:4.1f}  {groups['halves']['sigmas']:5.1f}",
+            f"{grown or 1.0:4.1f}  {halves or 0.0:5.1f}",
             flush=True,
         )
         print(f"{'':22} {result.message}")
