@@ -1,4 +1,4 @@
-"""Fit the weights of rmis_calib/vision/confidence.py again, and check them on seeds that the fit has not seen.
+"""Fit the weights of rmis_calib/vision/fine/confidence.py again, and check them on seeds that the fit has not seen.
 
     python tests/benchmarks/fit_confidence.py [--frames 10] [--seeds 1001 1002 1003 1004 1005 1006]
 
@@ -105,7 +105,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(1001, 1007)))
     options = parser.parse_args()
     recorder = Recorder()
-    confidence.chance = recorder
+    confidence.probability = recorder
     confidence.plausible = lambda trace, *_: torch.ones_like(
         trace.start_at_border
     )  # the gate would hide the false ones

@@ -1,6 +1,9 @@
 """Scenes for the solver's tests, from the independent simulation."""
 
+from dataclasses import replace
+
 import pytest
+import torch
 
 from data_synth.lines import simulate_lines
 from data_synth.settings import LineStudyConfig
@@ -15,6 +18,17 @@ def simulate():
         defaults = {"trials": 2, "positions_laparoscope": 2, "positions_instrument": 3, "pixel_noise_px": 0.0}
         arrays = simulate_lines(LineStudyConfig(**(defaults | fields)))
         return Problem.from_arrays(arrays), arrays["truth"], arrays
+
+    return build
+
+
+@pytest.fixture(scope="session")
+def unknown_noise():
+    """`unknown_noise(problem)`: the problem with its levels of noise left open."""
+
+    def build(problem):
+        nan = torch.full_like(problem.noise.image, torch.nan)
+        return replace(problem, noise=replace(problem.noise, image=nan, kinematics_mm=nan, kinematics_rad=nan))
 
     return build
 

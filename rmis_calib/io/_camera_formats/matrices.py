@@ -1,6 +1,6 @@
 """Files that hold camera matrices, distortions and [R t] under names that vary: OpenCV FileStorage and plain JSON."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +28,6 @@ _WIDTHS = ("Camera.width", "Camera_width", "image_width", "image_Width", "imageW
 _HEIGHTS = ("Camera.height", "Camera_height", "image_height", "image_Height", "imageHeight", "height")
 _SIZES = ("imageSize", "image_size", "size")
 _MODELS = ("distortion_model", "camera_model", "model")
-
-Lookup = Callable[[str], Any]
-"""The entry of this name as numbers, a text, or None."""
 
 
 def read_opencv(paths: tuple[Path, ...], note: Note, picture_size: PictureSize) -> StereoFile:

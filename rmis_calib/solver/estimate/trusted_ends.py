@@ -44,11 +44,7 @@ def trusted_ends(measured: MeasurementRows, state: State, noise: NoiseModel) -> 
     common = ~((spread > SCATTERED_MM) & (spread > ELSEWHERE * expected))
     near = (offset - centre[:, None]).abs() <= ELSEWHERE * torch.maximum(sigma, spread[:, None])
     kept = ok & (near & common[:, None] | ~torch.isfinite(centre)[:, None])
-    return measured.with_ends_of(replace(measured, end_ok=kept) if bool(kept.any()) else _without_ends(measured))
-
-
-def _without_ends(measured: MeasurementRows) -> MeasurementRows:
-    return replace(measured, end_xy=measured.end_xy[:, :0], end_var=measured.end_var[:0], end_ok=measured.end_ok[:0])
+    return replace(measured, end_ok=kept) if bool(kept.any()) else measured.without_ends()
 
 
 def _offsets(

@@ -211,11 +211,11 @@ class MeasurementRows:
 
     def with_ends_of(self, other: "MeasurementRows") -> "MeasurementRows":
         """Only those shaft ends that the other rows, of the same motions, have too."""
-        if not other.has_ends:
-            return replace(
-                self, **{name: getattr(self, name)[..., :0, :, :] for name in ("end_xy", "end_var", "end_ok")}
-            )
-        return replace(self, end_ok=self.end_ok & other.end_ok)
+        return replace(self, end_ok=self.end_ok & other.end_ok) if other.has_ends else self.without_ends()
+
+    def without_ends(self) -> "MeasurementRows":
+        """Without any shaft end."""
+        return replace(self, end_xy=self.end_xy[:, :0], end_var=self.end_var[:0], end_ok=self.end_ok[:0])
 
     def keep(self, camera_ok: Bool[Tensor, "c b n"]) -> "MeasurementRows":
         """Measurements of other cameras and motions marked as not measured."""

@@ -16,13 +16,8 @@ from rmis_calib.solver.settings import NoiseSettings, UnknownSettings
 EXACT = UnknownSettings(radius_sigma_relative=0.0)
 
 
-def unknown_noise(problem):
-    nan = torch.full_like(problem.noise.image, torch.nan)
-    return replace(problem, noise=replace(problem.noise, image=nan, kinematics_mm=nan, kinematics_rad=nan))
-
-
 @pytest.mark.parametrize("cameras", [1, 2])
-def test_noise_levels_are_found(simulate, realistic, cameras):
+def test_noise_levels_are_found(simulate, realistic, unknown_noise, cameras):
     """True: 0.3 px of 800, 0.3 mm, 0.1 deg; assumed: 0.56 px, 0.6 mm, 0.3 deg."""
     problem, _, _ = simulate(trials=2, **realistic)
     settings = SolverSettings(unknowns=EXACT, noise=NoiseSettings(kinematics_mm=0.6, kinematics_deg=0.3))

@@ -12,11 +12,6 @@ from rmis_calib.solver.model.parameters import columns
 from rmis_calib.solver.model.residuals import linearise
 
 
-def unknown_noise(problem):
-    nan = torch.full_like(problem.noise.image, torch.nan)
-    return replace(problem, noise=replace(problem.noise, image=nan, kinematics_mm=nan, kinematics_rad=nan))
-
-
 def test_restricted_likelihood_is_that_of_all_rows_together(simulate, realistic):
     """Against the textbook's formula on the stacked system: log |V| + log |X^T V^-1 X| + r^T V^-1 r."""
     problem, _, _ = simulate(trials=1, positions_laparoscope=1, positions_instrument=2, **realistic)
@@ -46,7 +41,7 @@ def _dense(model, state):
     return float(-0.5 * (torch.logdet(V) + torch.logdet(H) + quadratic))
 
 
-def test_pictures_ten_times_worse_than_assumed_are_not_blamed_on_the_joints(simulate):
+def test_pictures_ten_times_worse_than_assumed_are_not_blamed_on_the_joints(simulate, unknown_noise):
     """Image noise of 5 px where 0.6 px are assumed, and good joints."""
     problem, _, _ = simulate(
         trials=8, positions_laparoscope=1, positions_instrument=4, pixel_noise_px=5.0, kinematics_noise_mm=0.05,
