@@ -1,38 +1,34 @@
-"""The sub-commands: their arguments as dataclasses, each with one `run` that calls the public function and prints."""
+"""The sub-commands of one recording or result: their arguments as dataclasses, each with one `run`
+that calls the public function and prints. Those of the other modules are gathered here by name.
+"""
 
-import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
-from pydantic import ValidationError
 
-from rmis_calib.batches.settings import BatchSettings
 from rmis_calib.cli import EXIT_OK
 from rmis_calib.cli.baseline_command import Baseline as Baseline
-from rmis_calib.cli.batch_console import (
-    batch_reporter,
-    conclude_batch,
-    conclude_comparison,
-    say_plan,
-    stopped_by_signal,
-)
-from rmis_calib.cli.console import ProgressCallback, conclude, conclude_check, print_table, progress_reporter, say
+from rmis_calib.cli.batch_commands import Batch as Batch
+from rmis_calib.cli.batch_commands import Compare as Compare
+from rmis_calib.cli.console import conclude, conclude_check, print_table, progress_reporter, say
 from rmis_calib.cli.convert_command import Convert as Convert
 from rmis_calib.cli.equipment import CamerasShow as CamerasShow
 from rmis_calib.cli.equipment import RobotsCheck as RobotsCheck
 from rmis_calib.cli.equipment import RobotsImport as RobotsImport
 from rmis_calib.cli.equipment import RobotsList as RobotsList
 from rmis_calib.cli.equipment import RobotsShow as RobotsShow
+from rmis_calib.cli.estimates import Estimates, Settings
 from rmis_calib.cli.info import Info as Info
 from rmis_calib.cli.paths import beside, check_output_folder, setting_inputs
+from rmis_calib.cli.rendered import Demo as Demo
+from rmis_calib.cli.rendered import Synth as Synth
 from rmis_calib.cli.study_commands import parse_study
 from rmis_calib.cli.usage import parse_arguments
 from rmis_calib.cli.view import View as View
 from rmis_calib.config import CalibrationConfig, load_config
-from rmis_calib.errors import InputError, OutputError
 from rmis_calib.exports.settings import ExportSettings, FormatName
 from rmis_calib.io.configs import check_regular
 from rmis_calib.io.folders import DESCRIPTION, recording_folder
@@ -43,10 +39,6 @@ from rmis_calib.io.outputs import (
     check_file,
     is_json_of,
 )
-from rmis_calib.io.validation import first_finding
-from rmis_calib.solver.settings import Method
-
-Settings = Annotated[CalibrationConfig, tyro.conf.arg(name="")]
 
 
 def parse(class_name: str, command: str, argv: Sequence[str]) -> Any:
@@ -60,7 +52,7 @@ def parse(class_name: str, command: str, argv: Sequence[str]) -> Any:
         return parse_study(argv)
     kind = globals()[class_name]
     config = _config_argument(argv)
-    default = kind.defaults(load_config(config)) if config and issubclass(kind, _Estimates) else None
+    default = kind.defaults(load_config(config)) if config and issubclass(kind, Estimates) else None
     return parse_arguments(kind, argv, f"rmis-calib {command}", default)
 
 
@@ -74,41 +66,7 @@ def _config_argument(argv: Sequence[str]) -> str | None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Estimates:
-    """What every estimating command can be told."""
-
-    config: str | None = None
-    """YAML file, or name of a shipped preset, that sets the defaults of the flags below."""
-    method: Method | None = None
-    """Estimator: joint (default), global (rotation first, then translation) or paper (IJCARS 2020)."""
-    settings: Settings = field(default_factory=CalibrationConfig)
-
-    @classmethod
-    def defaults(cls, settings: CalibrationConfig) -> Any:
-        """An instance whose required arguments are still to be given."""
-        required = {
-            spec.name: tyro.MISSING
-            for spec in dataclasses.fields(cls)
-            if spec.default is dataclasses.MISSING and spec.default_factory is dataclasses.MISSING
-        }
-        return cls(**required, settings=settings)
-
-    def resolved(self) -> CalibrationConfig:
-        if self.method is None:
-            return self.settings
-        return replace(self.settings, solver=replace(self.settings.solver, method=self.method))
-
-    def inputs(self) -> list[Path]:
-        """Files that the settings name, which exist.
-
-        Raises:
-            FileError: masks or a prior that are not there.
-        """
-        return setting_inputs(self.config, self.settings)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Check(_Estimates):
+class Check(Estimates):
     """Look a recording over before it is calibrated, within seconds: files and units, clocks, motion of the joints,
     repeated pictures, swapped cameras, and the accuracy to expect. Nothing is written.
 
@@ -128,7 +86,7 @@ class Check(_Estimates):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Calibrate(_Estimates):
+class Calibrate(Estimates):
     """Estimate camera_right_T_arm from a recording folder: stereo video and the joint log of both arms.
 
     Writes OUT/result.json, OUT/report.html, OUT/observations.npz (for `solve`), OUT/config.yaml and OUT/overlays.
@@ -168,62 +126,7 @@ class Calibrate(_Estimates):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Batch(_Estimates):
-    """Calibrate, or detect in, every recording below a folder or in a manifest, side by side.
-
-    Writes OUT/NAME a recording, OUT/index.html, OUT/summary.csv, .parquet and .json. What is done already with the same
-    inputs and settings is passed over, so an interrupted batch goes on where it stopped. Exit code 0: every result
-    passed its own checks; 1: one did not, or a recording failed.
-    """
-
-    root: tyro.conf.Positional[Path]
-    """Folder that is searched for recordings; or a manifest: .txt (a path a line), .csv (recording, name, config, and
-    settings by their dotted names) or .yaml (recordings: [{recording, name, config}])."""
-    out: Path
-    """Folder to write."""
-    task: Literal["calibrate", "detect"] = "calibrate"
-    """What to do; detect takes plain videos and folders of pictures, too."""
-    dry_run: bool = False
-    """List what would be done, and why; write nothing."""
-    batch: Annotated[BatchSettings, tyro.conf.arg(name="")] = field(default_factory=BatchSettings)
-
-    def run(self) -> int:
-        self.inputs()
-        config = self.resolved()
-        if self.dry_run:
-            from rmis_calib.batches import plan
-
-            return say_plan(plan(self.root, self.out, config, self.task, self.batch))
-        from rmis_calib.batches import batch
-
-        with batch_reporter() as progress, stopped_by_signal(self.batch.watch) as stop:
-            summary = batch(
-                self.root, self.out, config, task=self.task, settings=self.batch, progress=progress, stop=stop
-            )
-        return conclude_batch(summary, self.out / "index.html")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Compare:
-    """Compare results of one set-up: a pooled transform, whether they agree, which one does not fit, what drifts."""
-
-    results: tyro.conf.Positional[tuple[Path, ...]]
-    """Result files (result.json), or folders that hold one, in the order of their time."""
-
-    def run(self) -> int:
-        paths = [path / "result.json" if path.is_dir() else path for path in self.results]
-        for path in paths:
-            check_regular(path)
-        from rmis_calib.batches import compare
-        from rmis_calib.results import CalibrationResult
-
-        names = [str(path.parent if path.name == "result.json" else path) for path in paths]
-        results = [CalibrationResult.read(path) for path in paths]
-        return conclude_comparison(compare(results, names), dict(zip(names, results, strict=True)))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Solve(_Estimates):
+class Solve(Estimates):
     """Estimate camera_right_T_arm from an observations file (.npz), for people who bring their own vision."""
 
     observations: tyro.conf.Positional[Path]
@@ -381,87 +284,3 @@ class Detect:
             more = "" if drawn >= failed else "; --debug-frames -1 draws every frame"
             say(f"stages: {out / 'debug'} ({drawn} sheets; {failed} frames without a shaft{more})")
         return EXIT_OK
-
-
-@dataclass(frozen=True, kw_only=True)
-class Synth:
-    """Render a synthetic recording folder with its ground truth."""
-
-    out: tyro.conf.Positional[Path]
-    """Recording folder to write."""
-    preset: str = "demo"
-    """YAML file, or name of a shipped preset (configs/synth)."""
-    motions: int | None = None
-    """Number of motions, one stereo frame each."""
-    seed: int | None = None
-    """Seed of everything random."""
-    overwrite: bool = False
-    """Replace OUT, if all of it was written by this program."""
-
-    def run(self) -> int:
-        with progress_reporter() as progress:
-            render_recording(self.out, self.preset, self.motions, self.seed, self.overwrite, progress)
-        say(f"recording: {self.out}")
-        return EXIT_OK
-
-
-@dataclass(frozen=True, kw_only=True)
-class Demo(_Estimates):
-    """Render a stereo recording, calibrate it, compare with the truth, leave a report."""
-
-    out: Path = Path("demo_output")
-    """Folder to write."""
-    motions: int = 60
-    """Number of motions, one stereo frame each."""
-    seed: int = 1
-    """Seed of the rendering."""
-    overwrite: bool = False
-    """Replace OUT, if all of it was written by this program."""
-
-    def run(self) -> int:
-        recording = self.out / "recording"
-        calibration = self.out / "calibration"
-        for folder in (recording, calibration):
-            check_output_folder(folder, self.inputs(), self.overwrite)
-        from rmis_calib.io.description import read_description
-        from rmis_calib.pipeline import evaluate
-        from rmis_calib.report import calibrate_to_folder
-
-        with progress_reporter() as progress:
-            render_recording(recording, "demo", self.motions, self.seed, self.overwrite, progress)
-            description = read_description(recording)
-            result = calibrate_to_folder(
-                description, calibration, self.resolved(), overwrite=self.overwrite, progress=progress
-            )
-        code = conclude(result, calibration / "report.html")
-        print_table("against the truth of the rendering", evaluate(result, recording).rows())
-        return code
-
-
-def render_recording(
-    out: Path, preset: str, motions: int | None, seed: int | None, overwrite: bool, progress: ProgressCallback
-) -> None:
-    """Render a preset of `configs/synth`, with another number of motions or another seed where given.
-
-    Raises:
-        InputError: no such preset, or an impossible value in it.
-        OutputError: the folder exists already, or cannot be written.
-    """
-    import data_synth
-
-    changes = {"motions": motions, "seed": seed}
-    try:
-        config = data_synth.load_synth_config(preset)
-        config = replace(config, **{key: value for key, value in changes.items() if value is not None})
-    except ValidationError as error:
-        raise first_finding(error, data_synth.SynthConfig, f"preset {preset}", InputError) from None
-    except (FileNotFoundError, ValueError) as error:
-        raise InputError(" ".join(str(error).split()), where="--preset") from error
-    try:
-        data_synth.write_recording(
-            out, config, overwrite=overwrite, on_progress=lambda done, total: progress("rendering", done, total)
-        )
-    except FileExistsError as error:
-        raise OutputError(where=str(out), expected=str(error), found="another one") from error
-    except OSError as error:
-        raise OutputError(where=str(out), expected="a place that can be written", found=error.strerror) from error

@@ -1,0 +1,48 @@
+"""What every estimating command can be told: the settings as flags, and the file that sets their defaults."""
+
+import dataclasses
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from rmis_calib.cli.paths import setting_inputs
+from rmis_calib.config import CalibrationConfig
+from rmis_calib.solver.settings import Method
+
+Settings = Annotated[CalibrationConfig, tyro.conf.arg(name="")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimates:
+    """What every estimating command can be told."""
+
+    config: str | None = None
+    """YAML file, or name of a shipped preset, that sets the defaults of the flags below."""
+    method: Method | None = None
+    """Estimator: joint (default), global (rotation first, then translation) or paper (IJCARS 2020)."""
+    settings: Settings = field(default_factory=CalibrationConfig)
+
+    @classmethod
+    def defaults(cls, settings: CalibrationConfig) -> Any:
+        """An instance whose required arguments are still to be given."""
+        required = {
+            spec.name: tyro.MISSING
+            for spec in dataclasses.fields(cls)
+            if spec.default is dataclasses.MISSING and spec.default_factory is dataclasses.MISSING
+        }
+        return cls(**required, settings=settings)
+
+    def resolved(self) -> CalibrationConfig:
+        if self.method is None:
+            return self.settings
+        return replace(self.settings, solver=replace(self.settings.solver, method=self.method))
+
+    def inputs(self) -> list[Path]:
+        """Files that the settings name, which exist.
+
+        Raises:
+            FileError: masks or a prior that are not there.
+        """
+        return setting_inputs(self.config, self.settings)
