@@ -21,13 +21,15 @@ from rmis_calib.solver.estimate.evidence import CHANCE, chances, freed
 from rmis_calib.solver.estimate.map_estimate import map_estimate
 from rmis_calib.solver.estimate.relinearise import Kinematics, solve_relinearised, start_of
 from rmis_calib.solver.model.measurement_rows import pack
-from rmis_calib.solver.problem import MIN_MOTIONS, Problem
+from rmis_calib.solver.observation_arrays import MIN_MOTIONS
+from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import Method, SolverSettings
-from rmis_calib.solver.solution import AlternativeModel, Solution, concatenate, map_tensors, take_solved
+from rmis_calib.solver.solution import AlternativeModel, Solution, concatenate, take_solved
 from rmis_calib.solver.start.candidates import best_candidate
 from rmis_calib.solver.start.line_statistics import LineStatistics
 from rmis_calib.solver.start.paper import average, empirical_covariance, influence, solve_paper, votes
 from rmis_calib.solver.status import MotionReason
+from rmis_calib.solver.tensors import map_tensors
 
 GROUP_MOTIONS = 32768
 """Motions (times trials) that are solved together: a batch of trials is cut into groups whose tensors stay in the

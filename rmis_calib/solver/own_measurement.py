@@ -83,9 +83,3 @@ class Measurement:
                 where=f"measurement {self.name!r}, sigma", expected="positive, or NaN", found=float(sigma.min())
             )
         return replace(self, values=values, sigma=sigma)
-
-    def map_tensors(self, function: Callable[[Tensor], Tensor]) -> "Measurement":
-        """With the function applied to values and sigma."""
-        return replace(
-            self, values={key: function(value) for key, value in self.values.items()}, sigma=function(self.sigma)
-        )

@@ -8,17 +8,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rmis_calib.errors import InputError, InsufficientDataError, ObservationsError
+from rmis_calib.errors import InputError, ObservationsError
 from rmis_calib.geometry.rigid import rigid_inverse
+from rmis_calib.solver.observation_arrays import ObservationArrays
 from rmis_calib.solver.own_measurement import Measurement
+from rmis_calib.solver.tensors import axes_of, map_tensors
 
-MIN_MOTIONS = 3
-CAMERAS = ("right", "left")
+KINDS = {"axis": "axis", "contours": "contour", "ends": "end", "heads": "head"}
+"""Kinds of measurement, as settings name them, and what their tensors are called after."""
 STILL_RAD, STILL_MM = 2e-3, 0.2
 """Reach of an arm that holds still (0.1 degrees of encoder noise, and what a hand does to it)."""
 
@@ -58,9 +59,13 @@ class NoiseLevels:
     setup_rad: Float[Tensor, "*batch"]
 
 
+_NONE_UNLESS_NAMED = ("camera_mm", "camera_rad", "edge_bias", "focal", "centre", "lens")
+"""Levels that are zero where the observations do not name them."""
+
+
 @dataclass(frozen=True)
 class Problem:
-    """Motions of one calibration, or of a batch of trials.
+    """Motions of one calibration, or of a batch of trials; the annotations say which axes a tensor has.
 
     Attributes:
         arm_T_rcm: pose of the RCM frame in the laparoscope arm's end-effector frame.
@@ -229,21 +234,14 @@ class Problem:
 
     def only(self, *kinds: str) -> "Problem":
         """The problem with these kinds of measurement alone (`axis`, `contours`, `ends`, `heads`)."""
-        names = {"axis": "axis_xy", "contours": "contour_xy", "ends": "end_xy", "heads": "head_xy"}
-        dropped = {
-            name: torch.full_like(getattr(self, name), torch.nan) for kind, name in names.items() if kind not in kinds
-        }
-        return replace(self, **dropped)
+        dropped = [f"{name}_xy" for kind, name in KINDS.items() if kind not in kinds]
+        return replace(self, **{name: torch.full_like(getattr(self, name), torch.nan) for name in dropped})
 
     def cameras(self, count: int) -> "Problem":
         """The problem seen by the first `count` cameras."""
-        start = len(self.batch_shape)
-        names = (
-            "camera_T_camera_right",
-            "valid",
-            *(f"{k}_{s}" for k in ("axis", "contour", "end", "head") for s in ("xy", "sigma")),
-        )
-        return replace(self, **{name: getattr(self, name).narrow(start, 0, count) for name in names})
+        k = len(self.batch_shape)
+        seen = [name for name, axes in axes_of(Problem).items() if "c" in axes]
+        return replace(self, **{name: getattr(self, name).narrow(k, 0, count) for name in seen})
 
     @property
     def end_measured(self) -> Bool[Tensor, "*batch c n"]:
@@ -253,53 +251,36 @@ class Problem:
 
     def select_motions(self, index: Tensor | slice) -> "Problem":
         """The problem of the motions `index` (positions, a mask or a slice), the same for every trial."""
-        return self._map_motions(lambda x, dim: x[(slice(None),) * dim + (index,)])
+        k = len(self.batch_shape)
+
+        def selected(x: Tensor, dim: int) -> Tensor:
+            return x[(slice(None),) * dim + (index,)]
+
+        changed: dict[str, Any] = {"own": map_tensors(self.own, lambda x: selected(x, k))}
+        for name, axes in axes_of(Problem).items():
+            value = getattr(self, name)
+            if value is not None and "n" in axes:
+                changed[name] = selected(value, k + axes.index("n"))
+        return replace(self, **changed)
 
     def flatten_batch(self) -> "Problem":
         """The same with exactly one leading axis of trials."""
         k = len(self.batch_shape)
-
-        def flat(x: Tensor) -> Tensor:
-            return x.reshape(self.n_trials, *x.shape[k:])
-
-        return _map_tensors(self, lambda x, _: flat(x))
+        return map_tensors(self, lambda x: x.reshape(self.n_trials, *x.shape[k:]))
 
     def detach(self) -> "Problem":
         """The same off any graph."""
-        return _map_tensors(self, lambda x, _: x.detach())
+        return map_tensors(self, Tensor.detach)
 
     def take_trials(self, index: Tensor | slice | int) -> "Problem":
         """The problem of some trials of the only batch axis, in this order; with a number, that trial without the
         axis."""
-        return _map_tensors(self, lambda x, _: x[index])
-
-    def _map_motions(self, function: Any) -> "Problem":
-        k = len(self.batch_shape)
-        after_camera = {
-            "axis_xy",
-            "axis_sigma",
-            "contour_xy",
-            "contour_sigma",
-            "end_xy",
-            "end_sigma",
-            "head_xy",
-            "head_sigma",
-            "valid",
-        }
-        constant = {"camera_T_camera_right", "radius_mm", "joint_offset_sigma", "joint_offset_at", "clock_at"}
-        constant |= {"laparoscope_base_T_instrument_base", "setup_stated"}
-        changed: dict[str, Any] = {}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, Tensor) and field.name not in constant:
-                changed[field.name] = function(value, k + (field.name in after_camera))
-        changed["own"] = tuple(own.map_tensors(lambda x: function(x, k)) for own in self.own)
-        return replace(self, **changed)
+        return map_tensors(self, lambda x: x[index])
 
     @classmethod
     def from_observations(cls, observations: Any, dtype: torch.dtype = torch.float64, device: str = "cpu") -> "Problem":
         """From an object with the keys of an observations file as attributes (`io.observations.ShaftObservations`)."""
-        return cls.from_arrays({key: getattr(observations, key, None) for key in OBSERVATION_KEYS}, dtype, device)
+        return cls.from_arrays(vars(observations), dtype, device)
 
     @classmethod
     def from_arrays(
@@ -314,7 +295,11 @@ class Problem:
             ObservationsError: a key is missing or an array has the wrong shape. InsufficientDataError: fewer than 3
             motions.
         """
-        return _Reader(arrays, dtype, device).problem()
+        read = ObservationArrays(arrays, dtype, device)
+        levels = {field.name: read.filled(f"sigma_{field.name}") for field in fields(NoiseLevels)}
+        for name in _NONE_UNLESS_NAMED:
+            levels[name] = torch.nan_to_num(levels[name], nan=0.0)
+        return cls(**read.motions(), **read.chains(), noise=NoiseLevels(**levels))
 
 
 def stands_still(laparoscope_base_T_arm: Float[Tensor, "*batch n 4 4"]) -> Bool[Tensor, "*batch"]:
@@ -324,157 +309,3 @@ def stands_still(laparoscope_base_T_arm: Float[Tensor, "*batch n 4 4"]) -> Bool[
     turned = away[..., :3, :3].square().sum((-2, -1)).sqrt().amax(-1)
     moved = torch.linalg.vector_norm(away[..., :3, 3], dim=-1).amax(-1)
     return (turned < STILL_RAD) & (moved < STILL_MM)
-
-
-OBSERVATION_KEYS = (
-    "arm_T_rcm", "rcm_v_axis", "camera_left_T_camera_right", "axis_right", "axis_left", "contour_right",
-    "contour_left", "shaft_radius_mm", "end_right", "end_left", "rcm_s_end_mm", "head_right", "head_left",
-    "rcm_p_head", "valid_right", "valid_left", "sigma_image", "sigma_kinematics_mm", "sigma_kinematics_rad",
-    "sigma_camera_mm", "sigma_camera_rad", "sigma_stereo_mm", "sigma_edge_bias", "sigma_stereo_rad",
-    "sigma_focal", "sigma_centre", "sigma_lens", "sigma_setup_mm", "sigma_setup_rad", "laparoscope_base_T_arm",
-    "laparoscope_base_T_instrument_base",
-    "sigma_axis_right", "sigma_axis_left", "sigma_contour_right", "sigma_contour_left", "sigma_end_right",
-    "sigma_end_left", "sigma_head_right", "sigma_head_left",
-)  # fmt: skip
-
-
-class _Reader:
-    """Turns a mapping of arrays into tensors of known shapes."""
-
-    def __init__(self, arrays: Mapping[str, Any], dtype: torch.dtype, device: str) -> None:
-        self.arrays, self.dtype, self.device = arrays, dtype, device
-        self.poses = self.tensor("arm_T_rcm")
-        if self.poses.ndim < 3 or self.poses.shape[-2:] != (4, 4):
-            raise ObservationsError(where="arm_T_rcm", expected="shape (..., N, 4, 4)", found=tuple(self.poses.shape))
-        self.batch, self.n = self.poses.shape[:-3], self.poses.shape[-3]
-        if self.n < MIN_MOTIONS:
-            raise InsufficientDataError(where="arm_T_rcm", expected=f"at least {MIN_MOTIONS} motions", found=self.n)
-        self.sides = (
-            CAMERAS if arrays.get("camera_left_T_camera_right") is not None and self._seen("left") else CAMERAS[:1]
-        )
-
-    def _seen(self, side: str) -> bool:
-        return any(self.arrays.get(f"{kind}_{side}") is not None for kind in ("axis", "contour", "end", "head"))
-
-    def tensor(self, key: str) -> Tensor:
-        value = self.arrays.get(key)
-        if value is None:
-            raise ObservationsError(where=key, expected="an array", found="nothing")
-        if isinstance(value, np.ndarray) and not value.flags.writeable:
-            value = value.copy()  # torch cannot share read-only memory
-        return torch.as_tensor(value, dtype=self.dtype, device=self.device)
-
-    def filled(self, key: str, *tail: int) -> Tensor:
-        """The array broadcast to (*batch, *tail), or NaN."""
-        shape = (*self.batch, *tail)
-        if self.arrays.get(key) is None:
-            return torch.full(shape, torch.nan, dtype=self.dtype, device=self.device)
-        value = self.tensor(key)
-        if value.ndim == 0 or (not tail and value.shape == ()):
-            return value.expand(shape).clone()
-        if value.shape != shape:
-            raise ObservationsError(where=key, expected=f"shape {shape}", found=tuple(value.shape))
-        return value
-
-    def both(self, name: str, *tail: int) -> Tensor:
-        return torch.stack([self.filled(name.format(side), self.n, *tail) for side in self.sides], dim=len(self.batch))
-
-    def noise(self) -> NoiseLevels:
-        levels = {field.name: self.filled(f"sigma_{field.name}") for field in fields(NoiseLevels)}
-        for name in ("camera_mm", "camera_rad", "edge_bias", "focal", "centre", "lens"):
-            levels[name] = torch.nan_to_num(levels[name], nan=0.0)
-        return NoiseLevels(**levels)
-
-    def problem(self) -> Problem:
-        axis, contour = self.both("axis_{}", 2, 2), self.both("contour_{}", 2, 2, 2)
-        valid = torch.stack([self._valid(side) for side in self.sides], dim=len(self.batch))
-        eye = torch.eye(4, dtype=self.dtype, device=self.device).expand(*self.batch, 4, 4)
-        cameras = [eye] + ([self.filled("camera_left_T_camera_right", 4, 4)] if len(self.sides) == 2 else [])
-        self.tensor("rcm_v_axis")  # required
-        v = self.filled("rcm_v_axis", self.n, 3)
-        unknown = torch.isnan(self.poses).flatten(-2).any(-1) | torch.isnan(v).any(-1)  # motions without kinematics
-        if bool(unknown.all(-1).any()):
-            raise ObservationsError(where="arm_T_rcm", expected="finite poses", found="NaN in every motion")
-        # They take the place of the first known motion, where they change nothing that is told from the poses.
-        first = (~unknown).int().argmax(-1, keepdim=True)
-        poses = torch.where(
-            unknown[..., None, None], torch.take_along_dim(self.poses, first[..., None, None], -3), self.poses
-        )
-        v = torch.where(unknown[..., None], torch.take_along_dim(v, first[..., None], -2), v)
-        valid = valid & ~unknown[..., None, :]
-        length = torch.linalg.vector_norm(v, dim=-1)
-        if not bool((torch.isfinite(length) & (length > 1e-9)).all()):
-            raise ObservationsError(
-                where="rcm_v_axis", expected="finite unit directions", found="a zero or infinite one"
-            )
-        problem = Problem(
-            arm_T_rcm=poses,
-            rcm_v_axis=v / length[..., None],
-            camera_T_camera_right=torch.stack(cameras, dim=-3),
-            axis_xy=axis,
-            axis_sigma=self.both("sigma_axis_{}"),
-            contour_xy=_canonical_edges(contour, axis),
-            contour_sigma=self.both("sigma_contour_{}", 2),
-            end_xy=self.both("end_{}", 2),
-            end_sigma=self.both("sigma_end_{}"),
-            head_xy=self.both("head_{}", 2),
-            head_sigma=self.both("sigma_head_{}"),
-            valid=valid,
-            rcm_s_end_mm=self.filled("rcm_s_end_mm", self.n),
-            rcm_p_head=self.filled("rcm_p_head", self.n, 3),
-            radius_mm=self.filled("shaft_radius_mm"),
-            noise=self.noise(),
-        )
-        return self._with_chains(problem, first, unknown)
-
-    def _with_chains(self, problem: Problem, first: Tensor, unknown: Tensor) -> Problem:
-        """The laparoscope's own kinematics and the set-up, where they are told; unknown motions as for `arm_T_rcm`."""
-        if self.arrays.get("laparoscope_base_T_arm") is None:
-            return problem
-        poses = self.filled("laparoscope_base_T_arm", self.n, 4, 4)
-        poses = torch.where(unknown[..., None, None], torch.take_along_dim(poses, first[..., None, None], -3), poses)
-        stated = self.filled("laparoscope_base_T_instrument_base", 4, 4)
-        eye = torch.eye(4, dtype=self.dtype, device=self.device).expand(*self.batch, 4, 4)
-        return replace(
-            problem,
-            laparoscope_base_T_arm=poses,
-            laparoscope_base_T_instrument_base=torch.where(torch.isnan(stated), eye, stated),
-            setup_stated=stated,
-        )
-
-    def _valid(self, side: str) -> Tensor:
-        value = self.arrays.get(f"valid_{side}")
-        if value is None:
-            return torch.ones((*self.batch, self.n), dtype=torch.bool, device=self.device)
-        if isinstance(value, np.ndarray):
-            value = value.astype(bool)  # a copy: torch cannot share read-only memory
-        return torch.as_tensor(value, dtype=torch.bool, device=self.device).expand(*self.batch, self.n)
-
-
-def _canonical_edges(
-    contour_xy: Float[Tensor, "*batch 2 2 2"], axis_xy: Float[Tensor, "*batch 2 2"]
-) -> Float[Tensor, "*batch 2 2 2"]:
-    """Edges swapped where edge 0 does not lie on the left-hand side (x right, y down) of the direction from the RCM
-    side to the tip."""
-    along = torch.where(
-        torch.isfinite(axis_xy).all(-1).all(-1)[..., None], axis_xy[..., 1, :] - axis_xy[..., 0, :], torch.nan
-    )
-    own = (contour_xy[..., 1, :] - contour_xy[..., 0, :]).sum(-2)
-    along = torch.where(torch.isfinite(along), along, own)
-    across = contour_xy[..., 0, :, :].mean(-2) - contour_xy[..., 1, :, :].mean(-2)
-    turn = along[..., 0] * across[..., 1] - along[..., 1] * across[..., 0]
-    return torch.where((turn > 0)[..., None, None, None], contour_xy.flip(-3), contour_xy)
-
-
-def _map_tensors(value: Any, function: Any) -> Any:
-    """A dataclass with `function(tensor, name)` applied to every tensor in it."""
-    changed = {}
-    for field in fields(value):
-        item = getattr(value, field.name)
-        if isinstance(item, Tensor):
-            changed[field.name] = function(item, field.name)
-        elif isinstance(item, NoiseLevels):
-            changed[field.name] = _map_tensors(item, function)
-        elif isinstance(item, tuple):
-            changed[field.name] = tuple(own.map_tensors(lambda x: function(x, "own")) for own in item)
-    return replace(value, **changed)

@@ -1,6 +1,5 @@
 """What a solve returns: the estimate, its uncertainty, a status with a sentence, and what the data cannot see."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
@@ -14,6 +13,7 @@ from rmis_calib.solver.model.state import State
 from rmis_calib.solver.observability import ObservabilityTensors, Verdict
 from rmis_calib.solver.settings import Method
 from rmis_calib.solver.status import SolveStatus
+from rmis_calib.solver.tensors import map_tensors
 
 
 @dataclass(frozen=True)
@@ -222,21 +222,6 @@ class Solution:
     @property
     def converged(self) -> Bool[Tensor, "*batch"]:
         return self.status == SolveStatus.CONVERGED
-
-
-def map_tensors(value: Any, function: Callable[[Tensor], Tensor]) -> Any:
-    """The value with the function applied to every tensor in it, however deep."""
-    if isinstance(value, Tensor):
-        return function(value)
-    if isinstance(value, dict):
-        return {key: map_tensors(item, function) for key, item in value.items()}
-    if isinstance(value, tuple):
-        return tuple(map_tensors(item, function) for item in value)
-    if is_dataclass(value) and not isinstance(value, type):
-        return replace(
-            value, **{field.name: map_tensors(getattr(value, field.name), function) for field in fields(value)}
-        )
-    return value
 
 
 def take_solved(solution: Solution, index: Int[Tensor, " k"]) -> Solution:

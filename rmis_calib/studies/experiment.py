@@ -215,7 +215,7 @@ def _rows(
 
 def drawn_lines(measured: "Measured", motions: int, cell: Experiment, generator: np.random.Generator) -> dict[str, Any]:
     """Arrays of an observations file (trials, motions, ...): in each trial other motions and other noise."""
-    from rmis_calib.solver.problem import OBSERVATION_KEYS
+    from rmis_calib.io.observations import OBSERVATION_KEYS
 
     lines = measured.lines
     n = len(lines["arm_T_rcm"]) - cell.pictures.validation
@@ -224,7 +224,7 @@ def drawn_lines(measured: "Measured", motions: int, cell: Experiment, generator:
     arrays: dict[str, Any] = {}
     for key in OBSERVATION_KEYS:
         value = lines.get(key)
-        if value is None or key.startswith("laparoscope_base_T_"):  # the set-up of an experiment is exact
+        if value is None or key.startswith(("laparoscope_base_T_", "unknown_")):  # set-up and offsets are exact
             continue
         is_constant = key in constant or np.ndim(value) == 0
         arrays[key] = (

@@ -7,7 +7,7 @@ and counting both would claim information twice.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -19,9 +19,11 @@ from rmis_calib.errors import ShapeError
 from rmis_calib.geometry.rotations import skew
 from rmis_calib.solver.model.batched_linalg import batch_last, rotate
 from rmis_calib.solver.model.compliance import coordinates
+from rmis_calib.solver.observation_arrays import CAMERAS
 from rmis_calib.solver.own_measurement import Measurement, OwnResidual
-from rmis_calib.solver.problem import CAMERAS, Problem
+from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import NoiseSettings
+from rmis_calib.solver.tensors import axes_of
 
 LINE, END, HEAD, OWN = 0, 1, 2, 3
 MIN_SIGMA = 1e-6
@@ -195,12 +197,10 @@ class MeasurementRows:
     def _map(self, of_motions: Callable[[Tensor], Tensor], of_trials: Callable[[Tensor], Tensor]) -> "MeasurementRows":
         """With a function applied to all tensors (..., b, n), another to those (..., b)."""
         changed: dict[str, Any] = {}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name in ("camera_R", "camera_t"):
-                changed[field.name] = of_trials(value)
-            elif isinstance(value, Tensor):
-                changed[field.name] = of_motions(value)
+        for name, axes in axes_of(MeasurementRows).items():
+            value = getattr(self, name)
+            if value is not None:
+                changed[name] = of_motions(value) if axes[-1] == "n" else of_trials(value)
         return replace(self, **changed, own=tuple(rows.map(of_motions) for rows in self.own))
 
     def repeat_trials(self, times: int) -> "MeasurementRows":

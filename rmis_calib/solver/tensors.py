@@ -1,0 +1,36 @@
+"""Dataclasses of tensors: the axes that their annotations tell, and one function for all tensors in them."""
+
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass, replace
+from functools import cache
+from typing import Any, get_args
+
+from torch import Tensor
+
+
+@cache
+def axes_of(kind: type) -> dict[str, tuple[str, ...]]:
+    """Names of the axes of every tensor of a dataclass, without those of the trials (`*batch`), as its annotation has
+    them; fields of other types are left out."""
+    axes = {}
+    for field in fields(kind):
+        for annotation in (field.type, *get_args(field.type)):
+            names = getattr(annotation, "dim_str", None)
+            if names is not None:
+                axes[field.name] = tuple(name for name in names.split() if name != "*batch")
+    return axes
+
+
+def map_tensors(value: Any, function: Callable[[Tensor], Tensor]) -> Any:
+    """The value with the function applied to every tensor in it, however deep."""
+    if isinstance(value, Tensor):
+        return function(value)
+    if isinstance(value, dict):
+        return {key: map_tensors(item, function) for key, item in value.items()}
+    if isinstance(value, tuple):
+        return tuple(map_tensors(item, function) for item in value)
+    if is_dataclass(value) and not isinstance(value, type):
+        return replace(
+            value, **{field.name: map_tensors(getattr(value, field.name), function) for field in fields(value)}
+        )
+    return value
