@@ -201,7 +201,7 @@ def arms_from_dict(robot: Mapping[str, Any]) -> dict[str, Arm]:
         )
         head = entry.get("head_point", {"frame": len(joints), "xyz_mm": [0.0, 0.0, 0.0]})
         arms[name] = Arm(
-            base_T_arm_base=np.asarray(entry["base_T_arm_base"], dtype=np.float64),
+            base_T_arm_base=np.asarray(entry.get("base_T_arm_base", np.eye(4)), dtype=np.float64),
             joints=joints,
             convention=robot["dh_convention"],
             end_T_tool=np.asarray(entry.get("end_T_tool", np.eye(4)), dtype=np.float64),

@@ -5,7 +5,7 @@ Frames: `base` is shared by all arms; `arm_base` is the base of one arm. A table
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -88,6 +88,16 @@ class Robot:
     name: str
     dh_convention: DhConvention
     arms: Mapping[str, Arm]
+    setup_sigma_mm: float | None = None
+    """How well the bases are known: 1 sigma per axis of the pose of one arm's base in another's. None: exactly. With
+    it a calibration estimates that pose too, near to what `base_T_arm_base` says."""
+    setup_sigma_rad: float | None = None
+    """The same of its orientation; both or neither."""
+
+    def without_bases(self) -> "Robot":
+        """The same arms, with nothing said of where their bases are."""
+        arms = {name: replace(arm, base_T_arm_base=None) for name, arm in self.arms.items()}
+        return replace(self, arms=arms, setup_sigma_mm=None, setup_sigma_rad=None)
 
     def joints(self, *arms: str) -> dict[str, Joint]:
         """Joints of these arms by their column in joints.csv, in the order of the tables.

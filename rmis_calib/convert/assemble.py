@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from rmis_calib.convert.bases import with_logged_bases
 from rmis_calib.convert.joints import Readings, choose_robot, motion_of, readings_of, robot_arms
 from rmis_calib.convert.material import NEEDS_STEREO, NS, ArmLog, Job, Material
 from rmis_calib.convert.settings import ConvertSettings
 from rmis_calib.errors import RecordingError
 from rmis_calib.io.joints import JointLog
-from rmis_calib.io.robot import load_robot
+from rmis_calib.io.robot import load_robot, robot_to_dict
 from rmis_calib.robot import Robot
 
 _STILL = ("none", "None", "null")
@@ -24,24 +25,26 @@ def assemble(material: Material, job: Job, settings: ConvertSettings) -> None:
     Raises:
         RecordingError: no instrument's arm, no robot that can be told, no cameras; says what to give.
     """
-    instrument = _instrument(material.arms, settings, job)
-    laparoscope = _laparoscope(material.arms, instrument, settings, job)
+    instrument = _instrument(material.logs.arms, settings, job)
+    laparoscope = _laparoscope(material.logs.arms, instrument, settings, job)
     logs = [log for log in (instrument, laparoscope) if log is not None]
     name = settings.robot or material.robot or choose_robot(logs, job.note)
     robot = load_robot(name, job.note)
     instrument_arm, laparoscope_arm = robot_arms(robot)
     if laparoscope is not None and laparoscope_arm is None:
         raise RecordingError(where=name, expected=f"an arm for {laparoscope.name}, or --laparoscope none", found="none")
-    arms = {instrument_arm: instrument} | (
-        {laparoscope_arm: laparoscope} if laparoscope is not None and laparoscope_arm else {}
-    )
+    arms, placed = {instrument_arm: instrument}, robot
+    if laparoscope is not None and laparoscope_arm is not None:
+        arms[laparoscope_arm] = laparoscope
+        in_robot_and_source = (laparoscope_arm, laparoscope.name), (instrument_arm, instrument.name)
+        placed = with_logged_bases(robot, *in_robot_and_source, material.logs.placings, job.note)
     origin_ns = int(material.frame_ns[0]) // NS * NS
     job.note(f"time 0 is {origin_ns // NS} s on the source's clock")
     _write_joints(job.folder / "joints.csv", robot, arms, origin_ns, job)
     _write_frame_times(job.folder / "frame_times.csv", material.frame_ns, origin_ns)
     content = {
         "format": "rmis-calib/1",
-        "robot": _robot_entry(name, job.folder),
+        "robot": _robot_entry(name, None if placed is robot else placed, job.folder),
         "stereo": _stereo_entry(material, job, settings),
         "right": material.right,
     }
@@ -147,8 +150,12 @@ def _seconds(ns: int) -> str:
     return f"{sign}{size // NS}.{size % NS:09d}"
 
 
-def _robot_entry(name: str, folder: Path) -> str:
-    """A shipped robot by name; a file is copied into the recording."""
+def _robot_entry(name: str, placed: Robot | None, folder: Path) -> str:
+    """A shipped robot by name; a file is copied into the recording; one whose bases were found is written."""
+    if placed is not None:
+        text = yaml.safe_dump(robot_to_dict(placed), sort_keys=False, default_flow_style=None, width=200)
+        (folder / "robot.yaml").write_text(text, encoding="utf-8")
+        return "robot.yaml"
     if Path(name).suffix.lower() in (".yaml", ".yml"):
         shutil.copyfile(name, folder / "robot.yaml")
         return "robot.yaml"

@@ -8,7 +8,7 @@ import numpy as np
 import yaml
 
 from rmis_calib.convert.files import take, take_pictures
-from rmis_calib.convert.material import NS, ArmLog, Job, Material
+from rmis_calib.convert.material import NS, ArmLog, Job, Logs, Material
 from rmis_calib.convert.settings import ConvertSettings
 from rmis_calib.errors import RecordingError
 from rmis_calib.io.folders import natural_order
@@ -51,7 +51,7 @@ def convert_surgpose(job: Job, settings: ConvertSettings) -> Material:
     )
     suffixes = {side: video.suffix for side, video in videos.items()}
     return Material(
-        arms, cameras, frame_ns, f"right{suffixes['right']}", f"left{suffixes['left']}", robot="dvrk-classic"
+        Logs(arms), cameras, frame_ns, f"right{suffixes['right']}", f"left{suffixes['left']}", robot="dvrk-classic"
     )
 
 
@@ -92,7 +92,7 @@ def convert_surgsync(job: Job, settings: ConvertSettings) -> Material:
         if found:
             take_pictures([found[number] for number in numbers], job.folder / side)
     job.note(f"SurgSync: {len(numbers)} frames; stamps of the right pictures and of each arm's measured_js")
-    return Material(arms, cameras, np.array(frame_ns, dtype=np.int64), "right", "left" if eyes["left"] else None)
+    return Material(Logs(arms), cameras, np.array(frame_ns, dtype=np.int64), "right", "left" if eyes["left"] else None)
 
 
 def _add_kinematics(log: ArmLog, path: Path, stamp: dict[str, Any] | None, frame_ns: int) -> None:

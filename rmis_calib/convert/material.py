@@ -39,10 +39,50 @@ class ArmLog:
 
 
 @dataclass
+class PoseLog:
+    """Poses of one frame in another; m, stamps in ns."""
+
+    frame: str = ""
+    """Name of the other frame."""
+    ns: list[int] = field(default_factory=list)
+    poses: list[np.ndarray] = field(default_factory=list)
+    """x, y, z (m), qx, qy, qz, qw."""
+
+    def add(self, ns: int, pose: np.ndarray, frame: str) -> None:
+        self.ns.append(ns)
+        self.poses.append(pose)
+        self.frame = frame.strip("/")
+
+
+@dataclass(frozen=True)
+class Placing:
+    """Which pose of an arm it is: of its base, as the set-up joints tell, or of its tip; and in which frame."""
+
+    arm: str
+    what: Literal["base", "tip"]
+    is_local: bool
+    """In the frame of the cart (base) or in the arm's own base (tip); else in the frame that the messages name."""
+
+
+@dataclass
+class Logs:
+    """All that a source logs of the arms."""
+
+    arms: dict[str, ArmLog]
+    placings: dict[Placing, PoseLog] = field(default_factory=dict)
+    """What may tell where the arms' bases are."""
+
+    def with_content(self) -> "Logs":
+        """Without arms of which nothing was logged."""
+        arms = {name: log for name, log in self.arms.items() if log.has_joints or log.poses}
+        return Logs(arms, {key: log for key, log in self.placings.items() if log.poses})
+
+
+@dataclass
 class Material:
     """All that a recording is made of."""
 
-    arms: dict[str, ArmLog]
+    logs: Logs
     cameras: StereoFile | None
     frame_ns: np.ndarray
     """(N,) int64, on the clock of the arms' stamps."""

@@ -1,14 +1,13 @@
 """What is whole of a bag that was cut off or damaged: its records read one after the other, without the index."""
 
 import bz2
-import os
-import shutil
 import struct
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO
+from urllib.parse import quote
 
 from rmis_calib.convert.topics import Topic
 from rmis_calib.errors import FileError
@@ -17,6 +16,7 @@ Messages = Callable[[set[str]], Iterator[tuple[str, int, Any]]]
 _RAW = tuple[str, str, str, int, bytes]
 """Topic, type, definition, received ns, data."""
 _LARGEST = 1 << 31
+_SQLITE_FLAGS = 0x1 | 0x40  # read only, the name is a URI
 
 
 @contextmanager
@@ -26,14 +26,29 @@ def salvaged(path: Path) -> Iterator[tuple[list[Topic], Messages]]:
     Raises:
         FileError: nothing of it can be read.
     """
-    files = sorted(p for p in path.iterdir() if p.suffix in _RECORDS) if path.is_dir() else [path]
-    files = [file for file in files if file.suffix in _RECORDS]
+    files = _files(path)
     counts: dict[tuple[str, str], int] = {}
     for topic, kind, _, _, _ in _records(files):
         counts[topic, kind] = counts.get((topic, kind), 0) + 1
     if not counts:
         raise FileError(where=str(path), expected="a bag of which something is whole", found="no whole message")
     yield [Topic(name, kind, count) for (name, kind), count in counts.items()], lambda names: _decoded(files, names)
+
+
+def can_salvage(path: Path) -> bool:
+    """Whether any message of a .bag, .mcap or .db3, or of those in a folder, is whole."""
+    return any(True for _ in _records(_files(path)))
+
+
+def _files(path: Path) -> list[Path]:
+    """Files that are what their names say."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    return [file for file in files if file.suffix in _RECORDS and _begins_like(file, _MAGIC[file.suffix])]
+
+
+def _begins_like(file: Path, magic: bytes) -> bool:
+    with file.open("rb") as opened:
+        return opened.read(len(magic)) == magic
 
 
 def _records(files: list[Path]) -> Iterator[_RAW]:
@@ -173,29 +188,13 @@ def _mcap_records(path: Path) -> Iterator[_RAW]:
 
 
 def _sqlite_records(path: Path) -> Iterator[_RAW]:
-    """Rows up to the first page that is not there. SQLite opens no file that is shorter than its header says: a copy is
-    filled up with zeros."""
-    with path.open("rb") as file:
-        head = file.read(100)
-    if len(head) < 100:
-        return
-    page_bytes = int.from_bytes(head[16:18], "big") or 65536
-    whole_bytes = (65536 if page_bytes == 1 else page_bytes) * int.from_bytes(head[28:32], "big")
-    if path.stat().st_size >= whole_bytes:
-        yield from _rows(path)
-        return
-    with tempfile.TemporaryDirectory(dir=path.parent if os.access(path.parent, os.W_OK) else None) as folder:
-        copy = Path(folder, path.name)
-        shutil.copyfile(path, copy)
-        os.truncate(copy, whole_bytes)
-        yield from _rows(copy)
-
-
-def _rows(path: Path) -> Iterator[_RAW]:
-    import sqlite3
+    """Rows up to the first page that is not there."""
+    import apsw
 
     try:
-        connection = sqlite3.connect(f"file:{path}?mode=ro&immutable=1", uri=True)
+        connection = apsw.Connection(
+            f"file:{quote(str(path.absolute()))}?immutable=1", _SQLITE_FLAGS, _filled_up().vfs_name
+        )
         topics = {row[0]: row[1:] for row in connection.execute("SELECT id, name, type FROM topics")}
         for topic_id, received_ns, data in connection.execute(
             "SELECT topic_id, timestamp, data FROM messages ORDER BY id"
@@ -203,10 +202,42 @@ def _rows(path: Path) -> Iterator[_RAW]:
             if topic_id in topics:
                 name, kind = topics[topic_id]
                 yield name, kind, "", received_ns, bytes(data)
-    except sqlite3.Error:
+    except (apsw.Error, TypeError):
         return
 
 
+@lru_cache(maxsize=1)
+def _filled_up() -> Any:
+    """Files as SQLite sees them, filled up with zeros: it opens none that is shorter than its header says."""
+    import apsw
+
+    class FilledUpFile(apsw.VFSFile):
+        def __init__(self, name: Any, flags: list[int]) -> None:
+            super().__init__("", name, flags)
+            head = super().xRead(min(100, super().xFileSize()), 0).ljust(100, b"\0")
+            page_bytes = int.from_bytes(head[16:18], "big")
+            self._size = (65536 if page_bytes == 1 else page_bytes) * int.from_bytes(head[28:32], "big")
+
+        def xFileSize(self) -> int:
+            return max(self._size, super().xFileSize())
+
+        def xRead(self, amount: int, offset: int) -> bytes:
+            there = max(0, min(amount, super().xFileSize() - offset))
+            return (super().xRead(there, offset) if there else b"").ljust(amount, b"\0")
+
+    class FilledUp(apsw.VFS):
+        vfs_name = "rmis-filled-up"
+
+        def __init__(self) -> None:
+            super().__init__(self.vfs_name, "")
+
+        def xOpen(self, name: Any, flags: list[int]) -> FilledUpFile:
+            return FilledUpFile(name, flags)
+
+    return FilledUp()
+
+
+_MAGIC = {".bag": b"#ROSBAG V2", ".mcap": b"\x89MCAP0\r\n", ".db3": b"SQLite format 3\0"}
 _RECORDS: dict[str, Callable[[Path], Iterator[_RAW]]] = {
     ".bag": _ros1_records,
     ".mcap": _mcap_records,

@@ -1,8 +1,5 @@
 """A session of the dVRK's recorder: mp4 with a sidecar JSON of time stamps, and a bag or extracted CSV of the arms."""
 
-import csv
-import json
-import re
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +7,9 @@ import numpy as np
 
 from rmis_calib.convert.bags import cameras_of, read_logs
 from rmis_calib.convert.files import take
-from rmis_calib.convert.material import NS, ArmLog, Job, Material
+from rmis_calib.convert.material import NS, Job, Logs, Material
 from rmis_calib.convert.settings import ConvertSettings
+from rmis_calib.convert.topic_tables import read_topic_table
 from rmis_calib.errors import RecordingError
 from rmis_calib.io._camera_formats.camera_info import CameraInfo
 from rmis_calib.io._checks import Note
@@ -30,7 +28,6 @@ _EYES = (("left_source_ns", "right_source_ns"), ("cpu_realtime_left_source_ns", 
 _LISTS = {"timestamps_ns": 1, "timestamps_ms": 1_000_000, "timestamps": None}
 _EARLIEST_NS = 100_000_000 * NS
 """1973: an earlier stamp is not since 1970, but a frame that carries none."""
-_ARM = re.compile(r"(PSM\d|ECM\d?)", re.IGNORECASE)
 _PAIR_SLACK = 0.5
 
 
@@ -45,7 +42,7 @@ def convert_session(job: Job, settings: ConvertSettings, video: Path | None = No
     videos = [p for p in videos if p.suffix.lower() in (".mp4", ".mkv", ".avi", ".mov")]
     right, left, sidecar = _choose(videos, job)
     stamps = _frame_stamps(right, sidecar, job.note)
-    arms, infos = _logs(folder, settings, job)
+    logs, infos = _logs(folder, settings, job)
     side_by_side = str(sidecar.get("side_by_side", "")).upper()
     layout = "side_by_side" if side_by_side in ("LR", "RL") else None
     if layout is not None:
@@ -58,7 +55,7 @@ def convert_session(job: Job, settings: ConvertSettings, video: Path | None = No
         cameras_of(infos, left is not None or layout is not None, bool(settings.rectified), job.note) if infos else None
     )
     return Material(
-        arms, cameras, stamps, f"right{right.suffix}", None if left is None else f"left{left.suffix}", layout,
+        logs, cameras, stamps, f"right{right.suffix}", None if left is None else f"left{left.suffix}", layout,
         side_by_side == "RL",
     )  # fmt: skip
 
@@ -161,9 +158,9 @@ def _check_pair(right: Path, stamps: np.ndarray, left: Path, job: Job) -> None:
         raise RecordingError(where=str(left), expected=expected, found=found)
 
 
-def _logs(folder: Path, settings: ConvertSettings, job: Job) -> tuple[dict[str, ArmLog], dict[str, CameraInfo]]:
+def _logs(folder: Path, settings: ConvertSettings, job: Job) -> tuple[Logs, dict[str, CameraInfo]]:
     """Logs of arms in bags and tables of a session's folder."""
-    arms: dict[str, ArmLog] = {}
+    logs = Logs({})
     infos: dict[str, CameraInfo] = {}
     bags = [path.parent for path in sorted(folder.rglob("metadata.yaml"))]
     bags += [
@@ -173,60 +170,13 @@ def _logs(folder: Path, settings: ConvertSettings, job: Job) -> tuple[dict[str, 
     ]
     for bag in bags:
         found, cameras = read_logs(bag, settings, job.note)
-        arms, infos = found | arms, cameras | infos
-        job.note(f"arms: {', '.join(found) or 'none'} of {bag.relative_to(folder)}")
+        logs = Logs(found.arms | logs.arms, found.placings | logs.placings)
+        infos = cameras | infos
+        job.note(f"arms: {', '.join(found.arms) or 'none'} of {bag.relative_to(folder)}")
     for path in sorted(folder.rglob("*.csv")):
-        _read_topic_csv(path, arms, job.note)
-    arms = {name: log for name, log in arms.items() if log.has_joints or log.poses}
-    if not arms:
+        read_topic_table(path, folder, logs, job.note)
+    logs = logs.with_content()
+    if not logs.arms:
         expected = "a bag or extracted tables (PSM1_measured_js.csv) beside the video"
         raise RecordingError(where=str(folder), expected=expected, found="neither")
-    return arms, infos
-
-
-def _read_topic_csv(path: Path, arms: dict[str, ArmLog], note: Note) -> None:
-    """One topic as the recorder's `extract` writes it: a row a message, fields flattened with dots."""
-    arm = _ARM.search(str(path.relative_to(path.parents[1])))
-    name = path.stem.lower()
-    if arm is None or "setpoint" in name or "jaw" in name or "goal" in name:
-        return
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        rows = list(csv.DictReader(file))
-    if not rows:
-        return
-    log = arms.setdefault(arm[1].upper(), ArmLog(arm[1].upper()))
-    columns = list(rows[0])
-    positions = [c for c in columns if re.fullmatch(r"position[._\[]?\d+\]?", c)]
-    pose = next((p for p in ("pose.position", "transform.translation") if f"{p}.x" in columns), None)
-    if ("js" in name or "joint" in name) and (positions or "position" in columns) and not log.has_joints:
-        for row in rows:
-            values = (
-                [row[c] for c in positions]
-                if positions
-                else json.loads(row["position"].replace("(", "[").replace(")", "]"))
-            )
-            log.joints.append(np.array([float(value) for value in values]))
-            log.joint_ns.append(_row_ns(row, path))
-        note(f"{path.name}: {len(rows)} readings of {log.name}")
-    elif pose is not None and "cp" in name and not log.poses:
-        turn = pose.replace("position", "orientation").replace("translation", "rotation")
-        fields = [f"{pose}.{axis}" for axis in "xyz"] + [f"{turn}.{axis}" for axis in "xyzw"]
-        log.is_local = "local" in str(path).lower()
-        log.pose_frame = rows[0].get("header.frame_id") or ""
-        for row in rows:
-            log.poses.append(np.array([float(row[field]) for field in fields]))
-            log.pose_ns.append(_row_ns(row, path))
-        note(f"{path.name}: {len(rows)} poses of {log.name}" + (" relative to its RCM" if log.is_local else ""))
-
-
-def _row_ns(row: dict[str, str], path: Path) -> int:
-    seconds, nanoseconds = row.get("header.stamp.sec"), row.get("header.stamp.nanosec") or row.get("header.stamp.nsec")
-    try:
-        if seconds and nanoseconds and int(seconds) > 0:
-            return int(seconds) * NS + int(nanoseconds)
-        value = row["timestamp"]
-        return int(value) if float(value) > 1e17 else round(float(value) * NS)
-    except (KeyError, ValueError, TypeError) as problem:
-        raise RecordingError(
-            where=str(path), expected="header.stamp.sec and .nanosec, or timestamp", found="neither"
-        ) from problem
+    return logs, infos

@@ -7,7 +7,7 @@ import numpy as np
 
 from rmis_calib.convert.files import take, take_pictures
 from rmis_calib.convert.joints import robot_arms
-from rmis_calib.convert.material import NS, ArmLog, Job, Material
+from rmis_calib.convert.material import NS, ArmLog, Job, Logs, Material
 from rmis_calib.convert.settings import ConvertSettings
 from rmis_calib.errors import RecordingError
 from rmis_calib.io._csv import Table, read_table
@@ -60,7 +60,7 @@ def convert_table(job: Job, settings: ConvertSettings) -> tuple[Material, Conver
         arms[name] = log
     frame_ns = _frame_ns(job, settings, count, own_ns, row_ns)
     settings = replace(settings, instrument=instrument, laparoscope=laparoscope or "none")
-    return Material(arms, None, frame_ns, names["right"], names.get("left")), settings
+    return Material(Logs(arms), None, frame_ns, names["right"], names.get("left")), settings
 
 
 def _only_table(folder: Path) -> Path:

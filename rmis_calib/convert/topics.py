@@ -4,6 +4,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from rmis_calib.convert.material import Placing
 from rmis_calib.convert.messages import CAMERA_INFO, COMPRESSED, IMAGE, JOINT_STATE, POSES
 from rmis_calib.convert.settings import ConvertSettings
 from rmis_calib.errors import RecordingError
@@ -45,6 +46,8 @@ class Choice:
     """By arm."""
     poses: dict[str, Topic]
     """By arm."""
+    placings: dict[Placing, Topic]
+    """What may tell where the arms' bases are."""
 
 
 def choose_topics(topics: Sequence[Topic], settings: ConvertSettings, note: Note, where: str) -> Choice:
@@ -66,10 +69,21 @@ def choose_topics(topics: Sequence[Topic], settings: ConvertSettings, note: Note
     for arm, topic in {**poses, **joints}.items():
         if topic.words[-1] not in (*_MEASURED_JOINTS, *_MEASURED_POSE):
             note(f"{arm}: {topic.name}, by its type ({topic.type.rpartition('/')[2]})")
+    return Choice(right, left, infos, joints, poses, _placings(topics))
+
+
+def _placings(topics: Sequence[Topic]) -> dict[Placing, Topic]:
+    """`[SUJ/]ARM/[local/]measured_cp`: of an arm's base (SUJ) and of its tip."""
+    found = {}
     for topic in topics:
-        if "SUJ" in topic.words and topic.words[-1] == "measured_cp" and topic.type in POSES and topic.count:
-            note(f"{topic.name} is in the bag and was not used: set-up joints tell an arm's base to some 50 mm only")
-    return Choice(right, left, infos, joints, poses)
+        words = [word for word in topic.words if word != "dvrk"]
+        if topic.type not in POSES or not topic.count or not words or words[-1] not in _MEASURED_POSE:
+            continue
+        is_base, is_local = words[0] == "SUJ", "local" in words[-1] or "local" in words[:-1]
+        arm = [word for word in words[is_base:-1] if word != "local"]
+        if len(arm) == 1 and _ARM.match(arm[0]):
+            found[Placing(arm[0], "base" if is_base else "tip", is_local)] = topic
+    return found
 
 
 def describe(topics: Sequence[Topic]) -> str:

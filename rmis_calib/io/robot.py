@@ -1,5 +1,6 @@
 """Robots from robot.yaml or a shipped preset (DESIGN.md 6.1)."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -28,14 +29,21 @@ def load_robot(name_or_path: str | Path, note: Note = no_note) -> Robot:
         path = config_path("robots", str(name_or_path), RobotError)
     schema = validate(RobotSchema, load_yaml(path, RobotError), str(path), RobotError)
     arms = {name: _arm(arm, f"{path}: arms.{name}", note) for name, arm in schema.arms.items()}
-    return Robot(schema.name, schema.dh_convention, arms)
+    sigma_rad = None if schema.setup_sigma_deg is None else math.radians(schema.setup_sigma_deg)
+    return Robot(schema.name, schema.dh_convention, arms, schema.setup_sigma_mm, sigma_rad)
 
 
 def robot_to_dict(robot: Robot) -> dict:
     """As robot.yaml writes it: `load_robot` of it gives the same numbers."""
+    prior = {}
+    if robot.setup_sigma_mm is not None and robot.setup_sigma_rad is not None:
+        # Digits beyond a micro-degree are the rounding of the conversion.
+        degrees = round(math.degrees(robot.setup_sigma_rad), 6)
+        prior = {"setup_sigma_mm": robot.setup_sigma_mm, "setup_sigma_deg": degrees}
     return {
         "name": robot.name,
         "dh_convention": robot.dh_convention,
+        **prior,
         "arms": {name: _arm_to_dict(arm) for name, arm in robot.arms.items()},
     }
 

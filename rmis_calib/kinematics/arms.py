@@ -62,6 +62,10 @@ class RobotKinematics:
         bases = [arm.base_T_arm_base for name, arm in robot.arms.items() if name in (laparoscope_arm, instrument_arm)]
         self.setup_is_stated = all(base is not None for base in bases)
         """Whether the robot tells where the bases of both arms are; else both are at the identity here."""
+        self.setup_sigma = None
+        """1 sigma per axis (mm, rad) of the set-up that the robot states; None where it is exact, or none is stated."""
+        if self.setup_is_stated and robot.setup_sigma_mm is not None and robot.setup_sigma_rad is not None:
+            self.setup_sigma = (robot.setup_sigma_mm, robot.setup_sigma_rad)
         self._laparoscope = None
         if laparoscope_arm is not None:
             self._laparoscope = _Arm(robot, laparoscope_arm, dtype, device, self.setup_is_stated)

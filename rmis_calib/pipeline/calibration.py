@@ -121,11 +121,12 @@ def calibrate_views(
 
 
 def _without_unknown_arm(recording: Recording, poses: MotionPoses) -> tuple[Recording, MotionPoses]:
-    """Without the laparoscope's arm where it stands still and nobody states where the arms' bases are: the pose of the
-    instrument's base in the camera is then all that there is to know."""
-    if poses.setup_is_stated or poses.laparoscope_base_T_arm is None or not stands_still(poses.laparoscope_base_T_arm):
+    """Without the laparoscope's arm where it stands still and nobody states exactly where the arms' bases are: the pose
+    of the instrument's base in the camera is then all that there is to know."""
+    exact = poses.setup_is_stated and poses.setup_sigma is None
+    if exact or poses.laparoscope_base_T_arm is None or not stands_still(poses.laparoscope_base_T_arm):
         return recording, poses
-    return replace(recording, laparoscope_arm=None), poses.in_instrument_base()
+    return replace(recording, laparoscope_arm=None, robot=recording.robot.without_bases()), poses.in_instrument_base()
 
 
 def _detect(

@@ -66,9 +66,11 @@ def setup_observations(poses: MotionPoses) -> dict[str, Any]:
     """The laparoscope's own kinematics, and the set-up where somebody states it."""
     if poses.laparoscope_base_T_arm is None or poses.laparoscope_base_T_instrument_base is None:
         return {}
-    arrays = {"laparoscope_base_T_arm": poses.laparoscope_base_T_arm.cpu().numpy()}
+    arrays: dict[str, Any] = {"laparoscope_base_T_arm": poses.laparoscope_base_T_arm.cpu().numpy()}
     if poses.setup_is_stated:
         arrays["laparoscope_base_T_instrument_base"] = poses.laparoscope_base_T_instrument_base.cpu().numpy()
+        if poses.setup_sigma is not None:
+            arrays["sigma_setup_mm"], arrays["sigma_setup_rad"] = poses.setup_sigma
     return arrays
 
 

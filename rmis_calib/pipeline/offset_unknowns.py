@@ -381,7 +381,7 @@ def with_found_bases(recording: Recording, offsets: KinematicOffsets) -> Recordi
     """The recording with the instrument's base where a calibration found it; without the laparoscope's arm where the
     instrument's base takes the place of `arm`."""
     if offsets.arm_is_instrument_base:
-        return replace(recording, laparoscope_arm=None)
+        return replace(recording, laparoscope_arm=None, robot=recording.robot.without_bases())
     if offsets.setup is None or recording.laparoscope_arm is None:
         return recording
     arms = dict(recording.robot.arms)

@@ -32,6 +32,7 @@ class MotionPoses:
             is no such arm.
         laparoscope_base_T_instrument_base: the set-up that `arm_T_rcm` was evaluated at.
         setup_is_stated: whether the robot tells it; else it was evaluated at the identity.
+        setup_sigma: how well it tells it, 1 sigma per axis in mm and rad; None: exactly.
     """
 
     frames: np.ndarray
@@ -42,6 +43,7 @@ class MotionPoses:
     laparoscope_base_T_arm: Float[Tensor, "m 4 4"] | None = None
     laparoscope_base_T_instrument_base: Float[Tensor, "4 4"] | None = None
     setup_is_stated: bool = True
+    setup_sigma: tuple[float, float] | None = None
 
     def select(self, which: Bool[Tensor, " m"]) -> "MotionPoses":
         """The poses of some motions."""
@@ -115,6 +117,7 @@ def poses_of(
         kinematics.laparoscope_base_T_arm(laparoscope),
         kinematics.laparoscope_base_T_instrument_base,
         kinematics.setup_is_stated,
+        kinematics.setup_sigma,
     )
 
 

@@ -33,9 +33,9 @@ def about_setup(solution: Solution, frame: str) -> tuple[str, ...]:
     """What became of the pose of one arm's base in the other's, in words."""
     if frame == INSTRUMENT_BASE:
         return (
-            "Nothing states where the arms' bases are (base_T_arm_base), and the laparoscope did not move: the answer "
-            "is camera_right_T_instrument_base, the pose of the instrument's base in the camera. It holds as long as "
-            "the laparoscope stays there.",
+            "Nothing states exactly where the arms' bases are (base_T_arm_base), and the laparoscope did not move: the "
+            "answer is camera_right_T_instrument_base, the pose of the instrument's base in the camera. It holds as "
+            "long as the laparoscope stays there.",
         )
     found = setup_of(solution)
     if found is None:

@@ -193,7 +193,9 @@ def _two_step_estimate(
 
 
 def with_setup(settings: SolverSettings, problem: Problem, method: Method) -> SolverSettings:
-    """The settings with what becomes of the set-up: `free` wherever nothing states it.
+    """The settings with what becomes of the set-up: `free` wherever nothing states it, and a prior where the
+    observations say how well it is known (of a laparoscope that stands still, such a prior tells less than nothing
+    stated: the instrument's base in the camera).
 
     Raises:
         ObservationsError: it is to be an unknown, and the laparoscope's own kinematics are not told.
@@ -208,6 +210,10 @@ def with_setup(settings: SolverSettings, problem: Problem, method: Method) -> So
         return settings
     stated = torch.isfinite(problem.setup_stated).flatten(-2).all(-1)
     chosen = asked if bool(stated.all()) else "free"
+    if chosen == "known" and bool(
+        (torch.isfinite(problem.noise.setup_mm) | torch.isfinite(problem.noise.setup_rad)).any()
+    ):
+        chosen = "free" if bool(problem.laparoscope_stands_still.all()) else "prior"
     if chosen != "known" and method != "joint":
         raise InputError(
             where="method",

@@ -76,8 +76,9 @@ class UnknownSettings:
     there only the priors enter the covariance."""
     setup: Literal["known", "prior", "free"] = "known"
     """The pose of the instrument's base in the laparoscope's: believed as stated, estimated within a prior about that,
-    or estimated with no prior. Where nothing states it, it is always `free`. A `known` one that the data contradict is
-    estimated within the prior, and the result says so."""
+    or estimated with no prior. Where nothing states it, it is always `free`. A `known` one is estimated within a prior
+    where the robot (`setup_sigma_mm`) or the observations (`sigma_setup_mm`) say how well it is known, and where the
+    data contradict it, which the result says."""
     setup_sigma_mm: Positive = 50.0
     """Prior of the stated set-up's translation, per axis, where the observations name none: what passive joints
     without good encoders tell."""

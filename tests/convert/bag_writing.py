@@ -123,8 +123,11 @@ def to_ns(seconds: float) -> int:
     return START_S * 10**9 + round(seconds * 1e9)
 
 
-def write_bag(recording: Path, bag: Path, kind: str, *, every_picture: int = 1) -> Path:
-    """A recording of two arms and two eyes as a bag: joints, raw pictures, and camera_info as ROS calibrates a pair."""
+def write_bag(
+    recording: Path, bag: Path, kind: str, *, every_picture: int = 1, more: Callable[[BagWriter], None] | None = None
+) -> Path:
+    """A recording of two arms and two eyes as a bag: joints, raw pictures, and camera_info as ROS calibrates a pair;
+    and whatever `more` writes."""
     times, columns, rows, stereo = read_recording(recording)
     infos = camera_infos(stereo)
     events: list[tuple[int, int, Callable[[BagWriter], None]]] = []
@@ -166,6 +169,8 @@ def write_bag(recording: Path, bag: Path, kind: str, *, every_picture: int = 1) 
     with BagWriter(bag, kind) as writer:
         for _, _, write in sorted(events, key=lambda event: event[:2]):
             write(writer)
+        if more is not None:
+            more(writer)
     return bag
 
 

@@ -117,8 +117,8 @@ def test_the_robot_is_told_by_its_poses(truth: str, expected: str) -> None:
 def test_the_robot_of_a_real_bag(shared_data: Path) -> None:
     bag = shared_data / "dvrk" / "pitch_exp_traj_01_test_cropped.bag"
     logs, infos = read_logs(bag, ConvertSettings(), silent)
-    assert list(logs) == ["PSM2"] and not infos
-    log = logs["PSM2"]
+    assert list(logs.arms) == ["PSM2"] and not infos
+    log = logs.arms["PSM2"]
     assert (len(log.joints), len(log.poses), log.pose_frame, log.is_local) == (3420, 3420, "ECM", False)
     notes: list[str] = []
     assert choose_robot([log], notes.append) == "dvrk-classic"

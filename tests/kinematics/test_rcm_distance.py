@@ -23,9 +23,12 @@ def moved(robot, x_mm: float):
 
 
 @pytest.mark.parametrize("name", ["dvrk-classic", "dvrk-classic-si-tool", "dvrk-si"])
-def test_presets_leave_both_arms_at_one_place(name: str) -> None:
-    # Offsets of 1.5708 for pi/2, as in the dVRK's own files, leave the axes some micrometres beside the point.
+def test_presets_do_not_say_where_the_bases_are(name: str) -> None:
     robot = load_robot(name)
+    assert all(arm.base_T_arm_base is None for arm in robot.arms.values())
+    assert RobotKinematics(robot, "laparoscope", "instrument").rcm_distance_mm() is None
+    # Offsets of 1.5708 for pi/2, as in the dVRK's own files, leave the axes some micrometres beside the point.
+    robot = replace(robot, arms={name: replace(arm, base_T_arm_base=np.eye(4)) for name, arm in robot.arms.items()})
     assert RobotKinematics(robot, "laparoscope", "instrument").rcm_distance_mm() == pytest.approx(0.0, abs=0.01)
     apart = RobotKinematics(moved(robot, 150.0), "laparoscope", "instrument").rcm_distance_mm()
     assert apart == pytest.approx(150.0, abs=0.01)

@@ -1,6 +1,8 @@
 """Robots whose bases nobody states: both transforms are found, from kinematics and from a file; a laparoscope that
 stands still leaves the pose of the instrument's base."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -10,8 +12,10 @@ from measured_from_truth import SMALL, observations_from_truth
 import data_synth
 import rmis_calib as rc
 from rmis_calib.config import parse_config
+from rmis_calib.errors import RobotError
 from rmis_calib.geometry.rigid import rigid_inverse
 from rmis_calib.geometry.rotations import rotation_angle
+from rmis_calib.io.robot import load_robot, robot_to_dict
 from rmis_calib.pipeline.estimation import estimate_with_kinematics
 from rmis_calib.pipeline.observations import setup_observations
 from rmis_calib.pipeline.offset_unknowns import KinematicUnknowns, poses_at
@@ -107,3 +111,62 @@ def test_a_still_laparoscope_leaves_the_instruments_base(recorded):
     expected = camera_T_rcm[0] @ rigid_inverse(torch.as_tensor(still[0]) @ first)
     gap = (result.camera_right_T_arm.t - expected[:3, 3]).norm()
     assert float(gap) < 4.0 * result.translation_sigma_mm
+
+
+def drawn_robot(stated):
+    """The robot with its instrument's base 50 mm and 5 deg from where it is, and that said."""
+    off = np.eye(4)
+    off[:3, :3] = [[np.cos(0.0873), -np.sin(0.0873), 0], [np.sin(0.0873), np.cos(0.0873), 0], [0, 0, 1]]
+    off[:3, 3] = [30.0, -40.0, 0.0]
+    arms = dict(stated.robot.arms)
+    arms["instrument"] = replace(arms["instrument"], base_T_arm_base=arms["instrument"].base_T_arm_base @ off)
+    return replace(stated.robot, arms=arms, setup_sigma_mm=50.0, setup_sigma_rad=0.0873)
+
+
+def test_a_roughly_known_set_up_is_a_prior(recorded, tmp_path):
+    path, stated, setup = recorded
+    rough = tmp_path / "robot.yaml"
+    rough.write_text(yaml.safe_dump(robot_to_dict(drawn_robot(stated))))
+    robot = load_robot(rough)
+    assert robot.setup_sigma_mm == 50.0 and robot.setup_sigma_rad == pytest.approx(0.0873, abs=1e-8)
+    recording = replace(stated, robot=robot)
+    result = rc.solve(observed(path, recording, motion_poses(recording)), CONFIG, throw=False)
+    truth = np.array(yaml.safe_load((path / "ground_truth.yaml").read_text())["camera_right_T_arm"])
+    gap_mm = np.linalg.norm(result.camera_right_T_arm.t.numpy() - truth[:3, 3])
+    assert gap_mm < 4.0 * result.translation_sigma_mm < 20.0
+    found = result.setup.laparoscope_base_T_instrument_base.matrix.numpy()
+    assert np.linalg.norm(found[:3, 3] - setup[:3, 3]) < 4.0 * result.setup.translation_sigma_mm
+    assert 40.0 < result.setup.from_stated_mm < 60.0 and 4.0 < result.setup.from_stated_deg < 6.0
+    # The same without saying so: the data contradict the stated base, and that is told.
+    believed = replace(stated, robot=replace(robot, setup_sigma_mm=None, setup_sigma_rad=None))
+    result = rc.solve(observed(path, believed, motion_poses(believed)), CONFIG, throw=False)
+    assert any("contradict the stated base" in sentence for sentence in result.observability.sentences)
+
+
+def test_a_still_laparoscope_with_a_roughly_known_set_up_leaves_the_instruments_base(recorded):
+    path, stated, _ = recorded
+    recording = replace(stated, robot=drawn_robot(stated))
+    arrays = observed(path, recording, motion_poses(recording)).to_arrays()
+    still = np.tile(arrays["laparoscope_base_T_arm"][0], (len(arrays["arm_T_rcm"]), 1, 1))
+    seen = rc.ShaftObservations.from_arrays(arrays | {"laparoscope_base_T_arm": still})
+    result = rc.solve(seen, CONFIG, throw=False)
+    assert result.camera_right_T_arm.name == "camera_right_T_instrument_base" and result.setup is None
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"setup_sigma_mm": 50.0}, "found only setup_sigma_mm"),
+        ({"setup_sigma_mm": 0.0, "setup_sigma_deg": 5.0}, "setup_sigma_mm"),
+        (
+            {"setup_sigma_mm": 50.0, "setup_sigma_deg": 5.0, "bases": False},
+            "expected base_T_arm_base of instrument, laparoscope",
+        ),
+    ],
+)
+def test_priors_of_a_set_up_that_make_no_sense(recorded, tmp_path, change, message):
+    _, stated, _ = recorded
+    robot = stated.robot if change.pop("bases", True) else stated.robot.without_bases()
+    (tmp_path / "robot.yaml").write_text(yaml.safe_dump(robot_to_dict(robot) | change))
+    with pytest.raises(RobotError, match=message):
+        load_robot(tmp_path / "robot.yaml")
