@@ -9,7 +9,8 @@ from torch import Tensor
 
 from rmis_calib.errors import RobotError, ShapeError
 from rmis_calib.geometry.rigid import rigid_inverse, transform_points
-from rmis_calib.kinematics.dh import build_chain, frame_poses
+from rmis_calib.kinematics.arm_chain import ArmChain
+from rmis_calib.kinematics.joint_twists import velocity_of
 from rmis_calib.robot import Arm, Robot
 
 # A shaft that misses its remote centre by more than this has the wrong frame number or the wrong table: real tables
@@ -68,8 +69,8 @@ class RobotKinematics:
             self.setup_sigma = (robot.setup_sigma_mm, robot.setup_sigma_rad)
         self._laparoscope = None
         if laparoscope_arm is not None:
-            self._laparoscope = _Arm(robot, laparoscope_arm, dtype, device, self.setup_is_stated)
-        self._instrument = _Arm(robot, instrument_arm, dtype, device, self.setup_is_stated)
+            self._laparoscope = ArmChain(robot, laparoscope_arm, dtype, device, self.setup_is_stated)
+        self._instrument = ArmChain(robot, instrument_arm, dtype, device, self.setup_is_stated)
         self.laparoscope_joints = () if self._laparoscope is None else self._laparoscope.names
         """Names of the laparoscope arm's joints, in the order of its readings."""
         self.instrument_joints = self._instrument.names
@@ -134,9 +135,7 @@ class RobotKinematics:
         """
         self._instrument.check(joints)
         # With the wrist straight the head point is a place on the shaft, whatever the wrist does now.
-        before_wrist = torch.arange(joints.shape[-1], device=joints.device) < self._shaft_frame
-        straight = torch.where(before_wrist, joints, 0.0)
-        both = self._instrument.frames_in_base(torch.stack([joints, straight]))
+        both = self._instrument.frames_in_base(torch.stack([joints, self._straight(joints)]))
         base_T_rcm = both[0, ..., self._rcm_frame, :, :]
         rcm_T_base = rigid_inverse(base_T_rcm)
         rcm_T_shaft = rcm_T_base @ both[0, ..., self._shaft_frame, :, :]
@@ -144,6 +143,57 @@ class RobotKinematics:
         base_T_head = both[..., self._head_frame, :, :]
         rcm_p_head, rcm_p_straight = transform_points(rcm_T_base @ base_T_head, self._head_p_point).unbind(0)
         return InstrumentPose(base_T_rcm, rcm_v_axis, rcm_p_head, (rcm_v_axis * rcm_p_straight).sum(-1))
+
+    def shaft_displacements(
+        self, laparoscope: Float[Tensor, "*batch l"], instrument: Float[Tensor, "*batch i"]
+    ) -> Float[Tensor, "*batch 6 j"]:
+        """Displacement of the shaft as a rigid body, seen from `arm`, per unit of each joint, rad or mm; the
+        laparoscope's joints first.
+
+        Returns:
+            Rotation vector, rad, and translation of the RCM, mm, in `rcm`. Joints between the RCM's frame and the
+            shaft's turn the shaft by v x dv and move its end, and so the shaft, by v ds; those beyond do not move it.
+
+        Raises:
+            ShapeError: another number of joints, or another dtype.
+        """
+        pose = self.instrument(instrument)
+        omega, shift = self._moves_of_shaft(instrument, pose)
+        if self._laparoscope is not None:
+            self._laparoscope.check(laparoscope)
+            away = -self._laparoscope.twists(laparoscope)
+            omega = torch.cat((away[..., :3], omega), dim=-2)
+            shift = torch.cat((velocity_of(pose.base_T_rcm[..., :3, 3], away), shift), dim=-2)
+        rcm_R_base = pose.base_T_rcm[..., :3, :3].mT
+        return torch.cat((rcm_R_base @ omega.mT, rcm_R_base @ shift.mT), dim=-2)
+
+    def _moves_of_shaft(
+        self, joints: Float[Tensor, "*batch i"], pose: InstrumentPose
+    ) -> tuple[Float[Tensor, "*batch i 3"], Float[Tensor, "*batch i 3"]]:
+        """Rotation vector of the shaft and translation of the RCM, in `base`, per unit of the instrument's joints."""
+        twist = self._instrument.twists(joints)
+        base_R_rcm, base_p_rcm = pose.base_T_rcm[..., :3, :3], pose.base_T_rcm[..., :3, 3]
+        base_T_head = self._instrument.frames_in_base(self._straight(joints))[..., self._head_frame, :, :]
+        base_p_end = transform_points(base_T_head, self._head_p_point)
+        base_v_axis = (base_R_rcm @ pose.rcm_v_axis[..., None])[..., 0]
+
+        def of(frame: int) -> Float[Tensor, "*batch i 6"]:
+            """Twists of the joints that move a frame."""
+            number = torch.arange(twist.shape[-2], device=twist.device)
+            return torch.where((number < frame)[:, None], twist, 0.0)
+
+        of_rcm, of_end = of(self._rcm_frame), of(min(self._shaft_frame, self._head_frame))
+        omega, shift = of_rcm[..., :3], velocity_of(base_p_rcm, of_rcm)
+        v = base_v_axis[..., None, :].expand_as(omega)
+        turn = of(self._shaft_frame)[..., :3]
+        dv = torch.linalg.cross(turn - omega, v)  # seen from `rcm`
+        along = (velocity_of(base_p_end, of_end) - shift) * v
+        along = along + torch.linalg.cross(turn, v) * (base_p_end - base_p_rcm)[..., None, :]
+        return omega + torch.linalg.cross(v, dv), shift + v * along.sum(-1, keepdim=True)
+
+    def _straight(self, joints: Float[Tensor, "*batch i"]) -> Float[Tensor, "*batch i"]:
+        """Readings with the wrist straight."""
+        return torch.where(torch.arange(joints.shape[-1], device=joints.device) < self._shaft_frame, joints, 0.0)
 
     def laparoscope_points(self, joints: Float[Tensor, "*batch j"]) -> Float[Tensor, "*batch frames 3"]:
         """Origins of the laparoscope arm's DH frames in `base`, its base first and its tool last, mm.
@@ -195,51 +245,6 @@ class RobotKinematics:
                 f"the z axis of shaft_frame {self._shaft_frame} through the origin of rcm_frame {self._rcm_frame}"
             )
             raise RobotError(where=where, expected=expected, found=f"a distance of {miss:.1f} mm")
-
-
-class _Arm:
-    """Chain of one arm with its constants as tensors."""
-
-    def __init__(
-        self, robot: Robot, name: str, dtype: torch.dtype, device: torch.device | str, base_is_stated: bool = True
-    ) -> None:
-        if name not in robot.arms:
-            raise RobotError(where=f"robot {robot.name}", expected=f"an arm {name!r}", found=", ".join(robot.arms))
-        table = robot.arms[name]
-
-        def constant(value: object) -> Tensor:
-            return torch.as_tensor(value, dtype=dtype, device=device)
-
-        self.names = tuple(row.name for row in table.joints)
-        self._rows = table.joints
-        self.end_T_tool = constant(table.end_T_tool)
-        self.base_T_arm_base = constant(table.base_T_arm_base) if base_is_stated else constant(torch.eye(4))
-        self._offsets = constant([float(row.offset) for row in table.joints])
-        self._chain = build_chain(table.joints, robot.dh_convention, dtype, device)
-
-    def check(self, joints: Tensor) -> None:
-        """Raise ShapeError unless these are readings of this arm, in its precision."""
-        if joints.shape[-1:] != (len(self.names),) or joints.dtype != self._offsets.dtype:
-            expected = f"(..., {len(self.names)}) of {self._offsets.dtype}: {', '.join(self.names)}"
-            found = f"{tuple(joints.shape)} of {joints.dtype}"
-            raise ShapeError(where="joint readings", expected=expected, found=found)
-
-    def spread_readings(self, count: int) -> Float[Tensor, "n j"]:
-        """Readings spread over the joints' limits; without limits half a radian, and 100 mm beside what `d` and the
-        offset take back."""
-        part = torch.linspace(0.1, 0.9, count, dtype=self._offsets.dtype, device=self._offsets.device)
-        columns = []
-        for i, row in enumerate(self._rows):
-            low, high = row.min, row.max
-            if low is None or high is None:
-                low, high = (-0.5, 0.5) if row.type == "revolute" else (50.0 - row.offset, 150.0 - row.offset)
-            # Each joint at its own rhythm: a straight line through joint space would leave the axes in one plane.
-            at = ((i + 1) * part * 1.618) % 1.0 if count > 1 else torch.full_like(part, 0.5)
-            columns.append(low + (high - low) * at)
-        return torch.stack(columns, dim=-1)
-
-    def frames_in_base(self, joints: Float[Tensor, "*batch j"]) -> Float[Tensor, "*batch frames 4 4"]:
-        return self.base_T_arm_base @ frame_poses(self._chain, joints + self._offsets)
 
 
 def _common_point(p: Float[Tensor, "n 3"], d: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], float]:

@@ -27,8 +27,8 @@ from rmis_calib.pipeline.advice import at_found_setup, with_next_motions
 from rmis_calib.pipeline.association import associate, consistent_choice, read_prior
 from rmis_calib.pipeline.calibration import calibrate_views, solve_choices
 from rmis_calib.pipeline.detection import no_progress
+from rmis_calib.pipeline.found_offsets import with_setup
 from rmis_calib.pipeline.observations import DIRECTION_UNKNOWN, assemble, problem_of
-from rmis_calib.pipeline.offset_unknowns import with_setup
 from rmis_calib.pipeline.poses import MotionPoses, poses_of, predict_contours
 from rmis_calib.pipeline.readiness import quick
 from rmis_calib.pipeline.run import CalibrationRun

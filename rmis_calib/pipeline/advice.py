@@ -21,8 +21,9 @@ from rmis_calib.geometry.cameras import Camera
 from rmis_calib.geometry.rigid import rigid_from_rotation_translation, rigid_inverse
 from rmis_calib.geometry.rotations import rotvec_to_matrix
 from rmis_calib.io import Recording
+from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
 from rmis_calib.pipeline.observations import problem_of
-from rmis_calib.pipeline.offset_unknowns import KinematicUnknowns, estimated_offsets
+from rmis_calib.pipeline.offset_unknowns import estimated_offsets
 from rmis_calib.pipeline.result import used_motions
 from rmis_calib.pipeline.run import CalibrationRun
 from rmis_calib.pipeline.words import joined

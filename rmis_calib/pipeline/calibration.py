@@ -18,16 +18,12 @@ from rmis_calib.pipeline.device import require_device
 from rmis_calib.pipeline.estimation import estimate, raise_unless_trustworthy
 from rmis_calib.pipeline.evaluation import head_point_errors, summarise_head_points
 from rmis_calib.pipeline.findings import about_motions, about_order
+from rmis_calib.pipeline.found_offsets import with_rcm_offset, with_setup
 from rmis_calib.pipeline.frozen import about_repeats, repeated_motions, without_frames
+from rmis_calib.pipeline.kinematic_unknowns import recording_unknowns
 from rmis_calib.pipeline.misfit import with_misfit_named
 from rmis_calib.pipeline.observations import assemble
-from rmis_calib.pipeline.offset_unknowns import (
-    estimated_offsets,
-    poses_at,
-    recording_unknowns,
-    with_rcm_offset,
-    with_setup,
-)
+from rmis_calib.pipeline.offset_unknowns import estimated_offsets
 from rmis_calib.pipeline.offsets import estimate_with_kinematics
 from rmis_calib.pipeline.poses import MotionPoses, frame_of, motion_poses
 from rmis_calib.pipeline.result import insufficient_data, make_result, motions_of, residual_of, residuals_px
@@ -183,7 +179,7 @@ def _choose_again(run: CalibrationRun, config: CalibrationConfig, several: bool,
         better = _better_choices(run, several)
         if better is None or all(new.same_as(old) for new, old in zip(better, run.choices, strict=True)):
             break
-        run = _solve(run.recording, config, run.views, run.poses, better, progress, run.clock_s)
+        run = _solve_again(run, config, better, progress)
     return run
 
 
@@ -207,31 +203,32 @@ def _better_choices(run: CalibrationRun, several: bool) -> tuple[Choice, ...] | 
     return tuple(better)
 
 
-def _as_told(recording: Recording, poses: MotionPoses) -> MotionPoses:
-    """The same motions without anything that a calibration found."""
-    told = motion_poses(recording, str(poses.arm_T_rcm.device))
-    return told.select(torch.as_tensor(np.isin(told.frames, poses.frames), device=told.arm_T_rcm.device))
-
-
 def _with_joint_offsets(run: CalibrationRun, config: CalibrationConfig, progress: Progress) -> CalibrationRun:
     """The same choice solved as configured, where the attempts before left the joint offsets out."""
     if _without_joint_offsets(config) == config:
         return run
-    return _solve(run.recording, config, run.views, run.poses, run.choices, progress, run.clock_s)
+    return _solve_again(run, config, run.choices, progress)
 
 
 def _with_cameras_as_given(run: CalibrationRun, config: CalibrationConfig) -> CalibrationRun:
     """The same choice solved without corrections of the cameras."""
     unknowns = replace(config.solver.unknowns, intrinsics=False)
     plain = replace(config, solver=replace(config.solver, unknowns=unknowns))
-    return _solve(run.recording, plain, run.views, run.poses, run.choices, no_progress, run.clock_s)
+    return _solve_again(run, plain, run.choices, no_progress)
+
+
+def _solve_again(
+    run: CalibrationRun, config: CalibrationConfig, choices: tuple[Choice, ...], progress: Progress
+) -> CalibrationRun:
+    """The same recording solved with other choices or settings, at the clock that was found."""
+    return _solve(run.recording, config, run.views, run.told, choices, progress, run.clock_s)
 
 
 def _solve(
     recording: Recording,
     config: CalibrationConfig,
     views: tuple[View, ...],
-    poses: MotionPoses,
+    told: MotionPoses,
     choices: tuple[Choice, ...],
     progress: Progress,
     clock_s: float | None = None,
@@ -241,11 +238,11 @@ def _solve(
     Every solve sets out from the kinematics as the recording tells them: a run's poses are at what it found, which must
     not be taken for what is stated.
     """
-    poses = _as_told(recording, poses)
+    poses, known = told, torch.ones_like(told.rcm_s_end_mm, dtype=torch.bool)
 
     def refused(why: str, observations: ShaftObservations | None) -> CalibrationRun:
-        result = insufficient_data(config, motions_of(recording, views, poses, choices, None), why)
-        return CalibrationRun(result, recording, views, poses, choices, observations, None)
+        result = insufficient_data(config, motions_of(recording, views, told, choices, None), why)
+        return CalibrationRun(result, recording, views, told, told, choices, observations, None)
 
     seen = int(torch.stack([choice.taken for choice in choices]).any(dim=0).sum())
     if seen < config.min_motions:
@@ -270,9 +267,9 @@ def _solve(
     columns = () if unknowns is None else unknowns.columns
     result = make_result(solution, motions, residuals, config, columns, notes, frame_of(recording))
     poses = with_rcm_offset(with_setup(poses, result.kinematic_offsets), result.kinematic_offsets.rcm_mm)
-    errors = head_point_errors(result, recording, poses_at(recording, result.kinematic_offsets, config.device))
+    errors = head_point_errors(result, recording, poses.select(known))
     residuals = result.residuals | {
         f"head_{side}": residual_of(distance, "px", np.isfinite(distance)) for side, distance in (errors or {}).items()
     }
     result = replace(result, residuals=residuals, head_point_error_px=summarise_head_points(errors))
-    return CalibrationRun(result, recording, views, poses, choices, observations, solution)
+    return CalibrationRun(result, recording, views, told, poses, choices, observations, solution)

@@ -14,7 +14,7 @@ from rmis_calib.geometry.rotations import matrix_to_rotvec
 from rmis_calib.io import Recording, load_recording, load_yaml
 from rmis_calib.io._checks import no_note, rigid_from_text
 from rmis_calib.io.configs import load_json
-from rmis_calib.pipeline.offset_unknowns import poses_at
+from rmis_calib.pipeline.found_offsets import poses_at
 from rmis_calib.pipeline.poses import MotionPoses
 from rmis_calib.results import CalibrationResult, HeadPointError
 

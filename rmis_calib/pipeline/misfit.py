@@ -15,8 +15,9 @@ from torch import Tensor
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.geometry.cameras import Camera, corrected_point
 from rmis_calib.pipeline.association import Choice
+from rmis_calib.pipeline.found_offsets import poses_at_motions
+from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
 from rmis_calib.pipeline.observations import ANOTHER_INSTRUMENT
-from rmis_calib.pipeline.offset_unknowns import KinematicUnknowns, poses_at_motions
 from rmis_calib.pipeline.run import CalibrationRun
 from rmis_calib.pipeline.stereo_order import looks_swapped, median_inverse_depth
 from rmis_calib.results import CalibrationResult

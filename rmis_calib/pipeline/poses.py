@@ -85,7 +85,7 @@ def motion_poses(recording: Recording, device: str = "cpu") -> MotionPoses:
         RobotError: the robot's description cannot carry the recording's arms.
     """
     kinematics = RobotKinematics(recording.robot, recording.laparoscope_arm, recording.instrument_arm, device=device)
-    _check_apart(recording, kinematics.rcm_distance_mm())
+    check_apart(recording, kinematics.rcm_distance_mm())
     instrument, known = recording.joints_at_frames(recording.instrument_arm)
     laparoscope, laparoscope_known = recording.joints_at_frames(recording.laparoscope_arm)
     frames = np.flatnonzero(known & laparoscope_known)
@@ -121,7 +121,7 @@ def poses_of(
     )
 
 
-def _check_apart(recording: Recording, distance_mm: float | None) -> None:
+def check_apart(recording: Recording, distance_mm: float | None) -> None:
     """Refuse two arms at one place: bases that nobody filled in, as in the shipped presets."""
     if distance_mm is None or distance_mm >= LEAST_RCM_DISTANCE_MM:
         return

@@ -22,9 +22,9 @@ from rmis_calib.pipeline.detection import View, no_progress, over_all
 from rmis_calib.pipeline.device import require_device
 from rmis_calib.pipeline.findings import Finding, about_motions, about_order, about_pictures
 from rmis_calib.pipeline.frozen import ChangeMeter, about_repeats, repeated_motions
+from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
 from rmis_calib.pipeline.masks import MaskReader, open_masks
 from rmis_calib.pipeline.observations import problem_of
-from rmis_calib.pipeline.offset_unknowns import KinematicUnknowns
 from rmis_calib.pipeline.poses import MotionPoses, motion_poses
 from rmis_calib.pipeline.run import CalibrationRun
 from rmis_calib.solver import SolveStatus

@@ -22,6 +22,7 @@ class CalibrationRun:
         result: the answer.
         recording: what was calibrated.
         views: frames and detections of each camera.
+        told: kinematics of the motions as the recording tells them; what every solve sets out from.
         poses: kinematics of the motions at the offsets and the set-up that were found; what `result` goes with.
         choices: candidate taken in each view.
         observations: what the solver saw.
@@ -31,6 +32,7 @@ class CalibrationRun:
     result: CalibrationResult
     recording: Recording
     views: tuple[View, ...]
+    told: MotionPoses
     poses: MotionPoses
     choices: tuple[Choice, ...]
     observations: ShaftObservations | None

@@ -12,7 +12,8 @@ from rmis_calib.errors import InputError
 from rmis_calib.geometry.rigid import rigid_inverse, transform_points
 from rmis_calib.io import Recording
 from rmis_calib.kinematics import RobotKinematics
-from rmis_calib.pipeline.offset_unknowns import KinematicUnknowns, poses_at, with_found_bases
+from rmis_calib.pipeline.found_offsets import with_found_bases
+from rmis_calib.pipeline.poses import check_apart
 from rmis_calib.results import CalibrationResult, KinematicOffsets
 
 _NO_OFFSETS = KinematicOffsets({}, 0.0, (0.0, 0.0))
@@ -73,9 +74,8 @@ def scene_of(recording: Recording, result: CalibrationResult | None = None) -> S
         RobotError: the robot's description cannot carry the recording's arms.
     """
     offsets = _NO_OFFSETS if result is None else result.kinematic_offsets
-    frames = poses_at(recording, offsets).frames
-    unknowns = KinematicUnknowns(recording, frames, "cpu")
-    return _scene(recording, frames, unknowns.readings_of_motions(offsets.clock_s), unknowns.columns, result)
+    columns, frames, readings = _readings(recording, offsets.clock_s)
+    return _scene(recording, frames, readings, columns, result)
 
 
 def advised_scene(recording: Recording, result: CalibrationResult) -> Scene | None:
@@ -83,13 +83,11 @@ def advised_scene(recording: Recording, result: CalibrationResult) -> Scene | No
     advice = result.observability.next_motions
     if not advice or advice[0].joints is None:
         return None
-    offsets = result.kinematic_offsets
-    frames = poses_at(recording, offsets).frames[-1:]
-    unknowns = KinematicUnknowns(recording, frames, "cpu")
-    readings = unknowns.readings_of_motions(offsets.clock_s)
-    for index, column in enumerate(unknowns.columns):
+    columns, frames, readings = _readings(recording, result.kinematic_offsets.clock_s)
+    readings = readings[-1:].clone()
+    for index, column in enumerate(columns):
         readings[:, index] = advice[0].joints.get(column, float(readings[0, index]))
-    return _scene(recording, frames, readings, unknowns.columns, result)
+    return _scene(recording, frames[-1:], readings, columns, result)
 
 
 def place_cameras(scene: Scene, recording: Recording, result: CalibrationResult) -> PlacedCameras:
@@ -133,6 +131,15 @@ def point_covariance(
     return J @ covariance @ J.T
 
 
+def _readings(recording: Recording, clock_s: float) -> tuple[tuple[str, ...], np.ndarray, Float[Tensor, "m j"]]:
+    """Columns of the joint log that move the arms, the frames at whose times it is known, and their readings."""
+    arms = [arm for arm in (recording.laparoscope_arm, recording.instrument_arm) if arm is not None]
+    columns = tuple(recording.robot.joints(*arms))
+    log, times_s = recording.joints.select(columns), recording.frame_times_s + recording.clock_offset_s
+    frames = np.flatnonzero(log.at(times_s)[1] & log.at(times_s + clock_s)[1])
+    return columns, frames, torch.as_tensor(log.interpolate(times_s[frames] + clock_s)[0])
+
+
 def _scene(
     recording: Recording,
     frames: np.ndarray,
@@ -145,6 +152,7 @@ def _scene(
     readings = readings + torch.tensor([found.get(column, 0.0) for column in columns], dtype=torch.float64)
     placed = recording if result is None else with_found_bases(recording, result.kinematic_offsets)
     kinematics = RobotKinematics(placed.robot, placed.laparoscope_arm, placed.instrument_arm)
+    check_apart(recording, kinematics.rcm_distance_mm())
     split = len(kinematics.laparoscope_joints)
     readings = readings[:, len(columns) - split - len(kinematics.instrument_joints) :]
     instrument, base_T_arm = kinematics.instrument(readings[:, split:]), kinematics.base_T_arm(readings[:, :split])

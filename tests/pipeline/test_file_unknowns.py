@@ -14,7 +14,8 @@ from rmis_calib.config import parse_config
 from rmis_calib.errors import ObservationsError
 from rmis_calib.geometry.rotations import rotation_angle
 from rmis_calib.pipeline.estimation import estimate_with_kinematics
-from rmis_calib.pipeline.offset_unknowns import FileUnknowns, KinematicUnknowns, estimated_offsets
+from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
+from rmis_calib.pipeline.offset_unknowns import FileUnknowns, estimated_offsets
 from rmis_calib.pipeline.poses import motion_poses
 from rmis_calib.solver import Problem
 

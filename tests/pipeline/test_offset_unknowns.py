@@ -10,9 +10,9 @@ import rmis_calib as rc
 from rmis_calib.config import parse_config
 from rmis_calib.geometry.rigid import rigid_inverse
 from rmis_calib.geometry.rotations import matrix_to_rotvec
-from rmis_calib.pipeline import offset_unknowns
+from rmis_calib.pipeline import kinematic_unknowns
 from rmis_calib.pipeline.estimation import estimate_with_kinematics
-from rmis_calib.pipeline.offset_unknowns import KinematicUnknowns
+from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
 from rmis_calib.pipeline.poses import motion_poses
 
 CLOCK_S = 0.72
@@ -64,7 +64,7 @@ def test_parts_of_a_recording_give_the_same_as_the_whole(moving, monkeypatch):
     zero, clock = torch.zeros(2, len(unknowns.columns), dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
     derivative = unknowns.joint_derivative(zero, clock)
     arm_T_rcm = unknowns.motion_poses(poses.frames, zero[0], 0.0)[0].arm_T_rcm
-    monkeypatch.setattr(offset_unknowns, "_AT_ONCE", 100)
+    monkeypatch.setattr(kinematic_unknowns, "_AT_ONCE", 100)
     torch.testing.assert_close(unknowns.joint_derivative(zero, clock), derivative, rtol=1e-9, atol=1e-9)
     again = unknowns.motion_poses(poses.frames, zero[0], 0.0)[0].arm_T_rcm
     torch.testing.assert_close(again, arm_T_rcm, rtol=1e-12, atol=1e-12)

@@ -17,8 +17,9 @@ from rmis_calib.geometry.rigid import rigid_inverse
 from rmis_calib.geometry.rotations import rotation_angle
 from rmis_calib.io.robot import load_robot, robot_to_dict
 from rmis_calib.pipeline.estimation import estimate_with_kinematics
+from rmis_calib.pipeline.found_offsets import poses_at
+from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
 from rmis_calib.pipeline.observations import setup_observations
-from rmis_calib.pipeline.offset_unknowns import KinematicUnknowns, poses_at
 from rmis_calib.pipeline.poses import motion_poses
 from rmis_calib.results import CalibrationResult
 
