@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test lint bench bench-check docs clean
+.PHONY: demo test lint bench bench-check docs package-check clean
 .DEFAULT_GOAL := demo
 
 $(STAMP): pyproject.toml
@@ -33,6 +33,9 @@ bench-check: $(STAMP)  ## a few minutes of benchmarks against tests/benchmarks/b
 docs: $(STAMP)  ## the documentation as a site that opens from disk: build/site/index.html
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+package-check: $(STAMP)  ## build wheel and sdist twice, compare, install the wheel elsewhere and use it
+	$(BIN)/python -m pytest -q tests/packaging
 
 clean:
 	rm -rf $(VENV) demo_output build dist .pytest_cache .ruff_cache .hypothesis
