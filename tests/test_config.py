@@ -55,7 +55,7 @@ def test_a_file_and_an_option_are_refused_in_the_same_words(raw, option, words):
     with pytest.raises(ConfigError) as of_file:
         parse_config(raw, where="my.yaml")
     with pytest.raises(ConfigError) as of_option:
-        parse("Solve", "solve", ["observations.npz", *option])
+        parse("Calibrate", "calibrate", ["recording", *option])
     assert words in str(of_file.value) and words in str(of_option.value)
 
 

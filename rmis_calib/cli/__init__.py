@@ -8,6 +8,7 @@ import difflib
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from pathlib import Path
 
 from rmis_calib import __version__
 from rmis_calib.cli.streams import guarded_output
@@ -28,6 +29,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "convert": ("Convert", "make a recording of a ROS bag, a dVRK session, a data set, or pictures with a table"),
     "view": ("View", "show arms, cameras, shaft and uncertainty in a browser, motion by motion"),
     "info": ("Info", "print versions, devices and paths, for a bug report"),
+    "completion": ("Completion", "print a script for bash or zsh that completes commands and options"),
     "cameras show": ("CamerasShow", "print a camera file of any known format as stereo.yaml, and draw it"),
     "robots list": ("RobotsList", "list the shipped robots"),
     "robots show": ("RobotsShow", "print a robot as robot.yaml"),
@@ -62,6 +64,9 @@ def _run(argv: list[str]) -> int:
     name, arguments = " ".join(argv[:words]), argv[words:]
     if name not in COMMANDS:
         return _not_a_command(argv)
+    if {"-h", "--help"} & set(arguments):
+        print(help_page(f"{name} {arguments[0]}") or help_page(name), end="")
+        return EXIT_OK
     try:
         command = import_module("rmis_calib.cli.commands").parse(COMMANDS[name][0], name, arguments)
     except SystemExit as exit_request:  # tyro has printed the help
@@ -75,6 +80,12 @@ def _run(argv: list[str]) -> int:
         return EXIT_INTERRUPTED
     except Exception as error:
         return _report(error)
+
+
+def help_page(name: str) -> str:
+    """What `--help` prints of a command, read from a file: nothing is imported for it. Empty where there is none."""
+    page = Path(__file__).with_name("help") / f"{name.replace(' ', '_')}.txt"
+    return page.read_text(encoding="utf-8") if page.is_file() else ""
 
 
 def _not_a_command(argv: list[str]) -> int:
@@ -113,7 +124,7 @@ def _fail(message: str) -> int:
 
 def _overview() -> str:
     lines = [f"rmis-calib {__version__}: markerless hand-eye calibration of a stereo laparoscope", ""]
-    lines += ["usage: rmis-calib COMMAND [OPTIONS]     (rmis-calib help COMMAND for one command's options)", ""]
+    lines += ["usage: rmis-calib COMMAND [options]     (rmis-calib help COMMAND shows one command's options)", ""]
     lines += [f"  {name:<13} {sentence}" for name, (_, sentence) in COMMANDS.items()]
     lines += [
         "",

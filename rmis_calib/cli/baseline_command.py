@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from rmis_calib.cli import EXIT_NOT_TRUSTWORTHY, EXIT_OK
-from rmis_calib.cli.console import say
+from rmis_calib.cli.console import say, summarise
 from rmis_calib.io.configs import check_regular
 from rmis_calib.io.outputs import BASELINE_FORMAT, check_apart, check_file, is_json_of
 
@@ -66,7 +66,8 @@ class Baseline:
             _print_transforms(chosen)
         if self.out is not None:
             _write(self.out, pairs, results)
-            say(f"written: {self.out}")
+        what = f"baseline {' '.join(map(str, self.poses))}"
+        summarise(what, *_facts(chosen), f"{len(pairs.base_T_flange)} pairs", self.out and f"written to {self.out}")
         return EXIT_OK if chosen.ok else EXIT_NOT_TRUSTWORTHY
 
     def _solve(self, pairs: "PosePairs") -> dict[str, "HandEye"]:
@@ -114,6 +115,17 @@ def _status(result: "HandEye") -> Any:
     from rmis_calib.baselines import HandEyeStatus
 
     return HandEyeStatus(int(result.status))
+
+
+def _facts(result: "HandEye") -> list[str]:
+    """The camera's pose in one line, or why there is none."""
+    if not result.ok:
+        return [_row(result)[0]]
+    name, pose = next(iter(result.transforms())), _row(result)
+    return [
+        f"{name} by {result.method}: t = ({', '.join(pose[:3])}) mm, q_xyzw = ({', '.join(pose[3:7])})",
+        f"1 sigma {pose[7]}",
+    ]
 
 
 def _reasons(pairs: "PosePairs", result: "HandEye") -> list[str]:

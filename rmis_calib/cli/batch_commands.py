@@ -15,6 +15,7 @@ from rmis_calib.cli.batch_console import (
     stopped_by_signal,
 )
 from rmis_calib.cli.estimates import Estimates
+from rmis_calib.cli.paths import named_beside
 from rmis_calib.io.configs import check_regular
 
 
@@ -30,8 +31,8 @@ class Batch(Estimates):
     root: tyro.conf.Positional[Path]
     """Folder that is searched for recordings; or a manifest: .txt (a path a line), .csv (recording, name, config, and
     settings by their dotted names) or .yaml (recordings: [{recording, name, config}])."""
-    out: Path
-    """Folder to write."""
+    out: Path | None = None
+    """Folder to write, or to go on with. Default: RECORDINGS_batch."""
     task: Literal["calibrate", "detect"] = "calibrate"
     """What to do; detect takes plain videos and folders of pictures, too."""
     dry_run: bool = False
@@ -41,17 +42,16 @@ class Batch(Estimates):
     def run(self) -> int:
         self.inputs()
         config = self.resolved()
+        out = self.out or named_beside(self.root.with_suffix("") if self.root.is_file() else self.root, "_batch")
         if self.dry_run:
             from rmis_calib.batches import plan
 
-            return say_plan(plan(self.root, self.out, config, self.task, self.batch))
+            return say_plan(plan(self.root, out, config, self.task, self.batch))
         from rmis_calib.batches import batch
 
         with batch_reporter() as progress, stopped_by_signal(self.batch.watch) as stop:
-            summary = batch(
-                self.root, self.out, config, task=self.task, settings=self.batch, progress=progress, stop=stop
-            )
-        return conclude_batch(summary, self.out / "index.html")
+            summary = batch(self.root, out, config, task=self.task, settings=self.batch, progress=progress, stop=stop)
+        return conclude_batch(f"batch {self.root}", summary, out / "index.html")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bars
 
 from rmis_calib.cli import EXIT_NOT_TRUSTWORTHY, EXIT_OK
-from rmis_calib.cli.console import LOG_INTERVAL_S, console, print_table, say, time_left
+from rmis_calib.cli.console import LOG_INTERVAL_S, print_table, say, summarise, time_left, transform_facts
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -109,7 +109,7 @@ def say_plan(plan: "Plan") -> int:
     return EXIT_OK
 
 
-def conclude_batch(summary: "BatchSummary", page: "Path") -> int:
+def conclude_batch(what: str, summary: "BatchSummary", page: "Path") -> int:
     """Counts, what needs a look with its cause, what set-ups show; the exit code says whether all can be trusted."""
     print_table("recordings", [(end.replace("_", " "), str(count)) for end, count in summary.counts.items()])
     for record in summary.records:
@@ -122,7 +122,9 @@ def conclude_batch(summary: "BatchSummary", page: "Path") -> int:
             say(f"\n{setup.setup}")
             for sentence in setup.sentences():
                 say(f"  {sentence}")
-    say(f"\nwritten: {page}")
+    say("")
+    counts = [f"{count} {end.replace('_', ' ')}" for end, count in summary.counts.items() if count]
+    summarise(what, *counts, f"written to {page}")
     return EXIT_OK if summary.trustworthy else EXIT_NOT_TRUSTWORTHY
 
 
@@ -149,7 +151,12 @@ def conclude_comparison(comparison: "SetupComparison", results: "dict[str, Calib
             print_table(
                 "pooled camera_right_T_arm", [("rotation | translation, mm", "\n".join(lines)), ("1 sigma", sigma)]
             )
-    for sentence in comparison.sentences():
-        console.print(sentence, soft_wrap=True, markup=False)
+    sentences = comparison.sentences()
+    for sentence in sentences:
+        say(sentence)
     all_fit = comparison.agrees and len(comparison.names) == len(results) and not comparison.outliers
+    facts = [f"{len(comparison.names)} of {len(results)} usable", *(sentence.rstrip(".") for sentence in sentences[:1])]
+    if comparison.pooled is not None and comparison.answer is not None:
+        facts += transform_facts(comparison.pooled)
+    summarise(f"compare {', '.join(results)}", *facts)
     return EXIT_OK if all_fit else EXIT_NOT_TRUSTWORTHY

@@ -5,7 +5,7 @@ that calls the public function and prints. Those of the other modules are gather
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import tyro
 
@@ -13,7 +13,16 @@ from rmis_calib.cli import EXIT_OK
 from rmis_calib.cli.baseline_command import Baseline as Baseline
 from rmis_calib.cli.batch_commands import Batch as Batch
 from rmis_calib.cli.batch_commands import Compare as Compare
-from rmis_calib.cli.console import conclude, conclude_check, print_table, progress_reporter, say
+from rmis_calib.cli.completion import Completion as Completion
+from rmis_calib.cli.console import (
+    conclude,
+    conclude_check,
+    print_table,
+    progress_reporter,
+    say,
+    summarise,
+    summarise_result,
+)
 from rmis_calib.cli.convert_command import Convert as Convert
 from rmis_calib.cli.equipment import CamerasShow as CamerasShow
 from rmis_calib.cli.equipment import RobotsCheck as RobotsCheck
@@ -29,7 +38,7 @@ from rmis_calib.cli.study_commands import parse_study
 from rmis_calib.cli.usage import parse_arguments
 from rmis_calib.cli.view import View as View
 from rmis_calib.config import CalibrationConfig, load_config
-from rmis_calib.exports.settings import ExportSettings, FormatName
+from rmis_calib.exports.settings import SUFFIXES, ExportSettings, FormatName
 from rmis_calib.io.configs import check_regular
 from rmis_calib.io.folders import DESCRIPTION, recording_folder
 from rmis_calib.io.outputs import (
@@ -50,10 +59,8 @@ def parse(class_name: str, command: str, argv: Sequence[str]) -> Any:
     """
     if command == "study":
         return parse_study(argv)
-    kind = globals()[class_name]
     config = _config_argument(argv)
-    default = kind.defaults(load_config(config)) if config and issubclass(kind, Estimates) else None
-    return parse_arguments(kind, argv, f"rmis-calib {command}", default)
+    return parse_arguments(globals()[class_name], argv, f"rmis-calib {command}", config and load_config(config))
 
 
 def _config_argument(argv: Sequence[str]) -> str | None:
@@ -76,6 +83,22 @@ class Check(Estimates):
 
     recording: tyro.conf.Positional[Path]
     """Recording folder."""
+    uses: ClassVar[tuple[str, ...]] = (
+        "device",
+        "masks",
+        "mask_labels",
+        "prior",
+        "instrument_at",
+        "measurements",
+        "model_sigma_px",
+        "edge_bias_px",
+        "focal_sigma_relative",
+        "centre_sigma_px",
+        "lens_sigma",
+        "min_motions",
+        "detector",
+        "solver",
+    )
 
     def run(self) -> int:
         recording_folder(self.recording)
@@ -122,7 +145,8 @@ class Calibrate(Estimates):
                 overlay_video=self.overlay_video,
                 progress=progress,
             )
-        return conclude(result, out / "report.html")
+        conclude(result)
+        return summarise_result(f"calibrate {self.recording}", result, out / "report.html")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,6 +159,7 @@ class Solve(Estimates):
     """Result file to write. Default: OBSERVATIONS_result.json, numbered."""
     overwrite: bool = False
     """Replace OUT, if it is a result of this program."""
+    uses: ClassVar[tuple[str, ...]] = ("device", "measurements", "clock_search_s", "solver")
 
     def run(self) -> int:
         from rmis_calib.io.observations import ShaftObservations
@@ -147,7 +172,8 @@ class Solve(Estimates):
 
         result = solve(observations, self.resolved(), throw=False)
         result.write(out)
-        return conclude(result, out)
+        conclude(result)
+        return summarise_result(f"solve {self.observations}", result, out)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,6 +211,8 @@ class Evaluate:
         print_table("evaluation", evaluation.rows())
         if self.out is not None:
             write_json(self.out, {"format": EVALUATION_FORMAT} | finite_or_none(evaluation.to_dict()))
+        facts = [f"{name} {value}" for name, value in evaluation.rows()]
+        summarise(f"evaluate {self.result} in {self.recording}", *facts, self.out and f"written to {self.out}")
         return EXIT_OK
 
 
@@ -199,8 +227,8 @@ class Export:
     """Result file (result.json), or a folder that holds one."""
     to: FormatName
     """Format. dvrk, ros-static-tf and surgsync are folders, the others files."""
-    out: Path
-    """File or folder to write."""
+    out: Path | None = None
+    """File or folder to write. Default: RESULT_FORMAT, numbered."""
     recording: Path | None = None
     """Recording folder of the result: dvrk and surgsync need its arms, joints and cameras."""
     overwrite: bool = False
@@ -214,18 +242,20 @@ class Export:
         check_regular(path)
         if self.recording is not None:
             recording_folder(self.recording)
+        named = path.absolute().parent if path.name == "result.json" else path.with_suffix("")
+        out = self.out or beside(named, f"_{self.to}", SUFFIXES[self.to])
         from rmis_calib.exports import export
 
         export(
             path,
             self.to,
-            self.out,
+            out,
             recording=self.recording,
             settings=self.settings,
             overwrite=self.overwrite,
             force=self.force,
         )
-        say(f"written: {self.out} ({self.to})")
+        summarise(f"export {path}", self.to, f"written to {out}")
         return EXIT_OK
 
 
@@ -255,6 +285,7 @@ class Detect:
     """Most sheets of `--debug` a camera. Where there are more frames, only those without a shaft get one (-1: every
     frame gets one)."""
     settings: Settings = field(default_factory=CalibrationConfig)
+    uses: ClassVar[tuple[str, ...]] = ("device", "batch_size", "every", "masks", "mask_labels", "detector")
 
     def run(self) -> int:
         from rmis_calib.io.description import read_description
@@ -283,4 +314,5 @@ class Detect:
             drawn, failed = pictures.sheets.total(), pictures.failed.total()
             more = "" if drawn >= failed else "; --debug-frames -1 draws every frame"
             say(f"stages: {out / 'debug'} ({drawn} sheets; {failed} frames without a shaft{more})")
+        summarise(f"detect {self.source}", *(f"{name} {value}" for name, value in table.rows()), f"written to {out}")
         return EXIT_OK

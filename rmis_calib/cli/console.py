@@ -1,9 +1,11 @@
 """What a person sees while a command runs: progress on a terminal, plain lines in a log, and the table at the end."""
 
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,16 +13,19 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from rmis_calib import __version__
 from rmis_calib.cli import EXIT_NOT_TRUSTWORTHY, EXIT_OK
 
 if TYPE_CHECKING:
+    from rmis_calib.batches.pooling import Pooled
     from rmis_calib.pipeline import RecordingCheck
     from rmis_calib.results import CalibrationResult, Nuisance
 
 ProgressCallback = Callable[[str, int, int], None]
 LOG_INTERVAL_S = 5.0
 
-console = Console(highlight=False)
+# NO_COLOR takes all styles away, not the colours alone, as rich would.
+console = Console(highlight=False, color_system=None if os.environ.get("NO_COLOR") else "auto")
 
 
 @contextmanager
@@ -57,8 +62,13 @@ def _line_reporter() -> ProgressCallback:
 
 
 def print_table(title: str, rows: list[tuple[str, str]]) -> None:
-    """Two columns: what, and how much with its unit."""
+    """Two columns: what, and how much with its unit. Wrapped on a terminal only, so that a log keeps paths whole."""
     console.print(title, soft_wrap=True)
+    if not console.is_terminal:
+        widest = max((len(name) for name, _ in rows), default=0)
+        for name, value in rows:
+            say(f"{name:<{widest}}  {value.replace(chr(10), chr(10) + ' ' * (widest + 2))}")
+        return
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     for name, value in rows:
         table.add_row(name, value)
@@ -94,8 +104,8 @@ def say(line: str) -> None:
     console.print(line, soft_wrap=True, markup=False)
 
 
-def conclude(result: "CalibrationResult", written: Path) -> int:
-    """Print the answer and where it is; the exit code says whether to trust it."""
+def conclude(result: "CalibrationResult") -> None:
+    """Print the answer."""
     console.print(result.status, style="bold", end="")
     say(f": {result.message}\n")
     print_table(result.camera_right_T_arm.name if result.camera_right_T_arm else "no transform", result_rows(result))
@@ -103,8 +113,32 @@ def conclude(result: "CalibrationResult", written: Path) -> int:
         say(f"note: {note}")
     if not result.trustworthy:
         print_advice(result.observability.advice)
-    say(f"written: {written}\n")
+    say("")
+
+
+def summarise(what: str, *facts: str | None) -> None:
+    """The last line, to be pasted into a lab book: when, which version, what was done, what came out, where it is."""
+    when = datetime.now().astimezone().isoformat(" ", "minutes")
+    say(f"{when} rmis-calib {__version__} {what}: {'; '.join(fact for fact in facts if fact)}")
+
+
+def summarise_result(what: str, result: "CalibrationResult", written: Path) -> int:
+    """The same for a calibration; the exit code says whether to trust it."""
+    used = f"{int(result.motions.used.sum())} of {len(result.motions.used)} motions, method {result.method}"
+    summarise(what, result.status, *transform_facts(result), used, f"written to {written}")
     return EXIT_OK if result.trustworthy else EXIT_NOT_TRUSTWORTHY
+
+
+def transform_facts(found: "CalibrationResult | Pooled") -> list[str]:
+    """A transform and its uncertainty in one line; nothing where there is none."""
+    facts, transform = [], found.camera_right_T_arm
+    if transform is not None:
+        position = ", ".join(f"{x:.3f}" for x in transform.matrix[:3, 3].tolist())
+        turn = ", ".join(f"{x:.6f}" for x in transform.quat_wxyz.tolist())
+        facts.append(f"{transform.name}: t = ({position}) mm, q_wxyz = ({turn})")
+    if found.rotation_sigma_deg is not None and found.translation_sigma_mm is not None:
+        facts.append(f"1 sigma {found.rotation_sigma_deg:.3f} deg, {found.translation_sigma_mm:.3f} mm")
+    return facts
 
 
 def conclude_check(check: "RecordingCheck", recording: Path) -> int:
@@ -117,7 +151,8 @@ def conclude_check(check: "RecordingCheck", recording: Path) -> int:
     for note in check.notes:
         say(f"note: {note}")
     count = len(check.doubts)
-    say("nothing speaks against calibrating it" if check.fit else f"{count} doubt{'s' if count > 1 else ''}: see above")
+    verdict = "nothing speaks against calibrating it" if check.fit else f"{count} doubt{'s' if count > 1 else ''}"
+    summarise(f"check {recording}", verdict)
     return EXIT_OK if check.fit else EXIT_NOT_TRUSTWORTHY
 
 

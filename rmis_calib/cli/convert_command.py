@@ -8,6 +8,7 @@ import tyro
 
 from rmis_calib.cli import EXIT_OK
 from rmis_calib.cli.console import progress_reporter, say
+from rmis_calib.cli.paths import beside
 from rmis_calib.convert.settings import ConvertSettings
 
 
@@ -22,23 +23,24 @@ class Convert:
 
     source: tyro.conf.Positional[Path]
     """Bag, video or folder."""
-    out: Path
-    """Recording folder to make; it appears only when it is complete."""
+    out: Path | None = None
+    """Recording folder to make; it appears only when it is complete. Default: SOURCE_recording, numbered."""
     overwrite: bool = False
     """Replace OUT, if all of it was written by this program."""
     settings: Annotated[ConvertSettings, tyro.conf.arg(name="")] = field(default_factory=ConvertSettings)
 
     def run(self) -> int:
+        out = self.out or beside(self.source if self.source.is_dir() else self.source.with_suffix(""), "_recording")
         from rmis_calib.convert import convert
 
         with progress_reporter() as progress:
             convert(
                 self.source,
-                self.out,
+                out,
                 self.settings,
                 overwrite=self.overwrite,
                 progress=progress,
                 on_note=lambda note: say(f"note: {note}"),
             )
-        say(f"recording: {self.out}   next: rmis-calib calibrate {self.out}")
+        say(f"recording: {out}   next: rmis-calib check {out}")
         return EXIT_OK

@@ -1,9 +1,8 @@
 """What every estimating command can be told: the settings as flags, and the file that sets their defaults."""
 
-import dataclasses
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, ClassVar
 
 import tyro
 
@@ -23,16 +22,8 @@ class Estimates:
     method: Method | None = None
     """Estimator: joint (default), global (rotation first, then translation) or paper (IJCARS 2020)."""
     settings: Settings = field(default_factory=CalibrationConfig)
-
-    @classmethod
-    def defaults(cls, settings: CalibrationConfig) -> Any:
-        """An instance whose required arguments are still to be given."""
-        required = {
-            spec.name: tyro.MISSING
-            for spec in dataclasses.fields(cls)
-            if spec.default is dataclasses.MISSING and spec.default_factory is dataclasses.MISSING
-        }
-        return cls(**required, settings=settings)
+    uses: ClassVar[tuple[str, ...] | None] = None
+    """Settings that the command uses, and that become its flags; None: all of them."""
 
     def resolved(self) -> CalibrationConfig:
         if self.method is None:

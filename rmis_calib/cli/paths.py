@@ -23,8 +23,13 @@ def setting_inputs(config: str | None, settings: CalibrationConfig) -> list[Path
 
 def beside(source: Path, ending: str, suffix: str = "") -> Path:
     """A fresh name beside an input, in the folder that holds it."""
+    return numbered(named_beside(source, ending), suffix)
+
+
+def named_beside(source: Path, ending: str) -> Path:
+    """The name beside an input, whether or not something is there already."""
     named = source if source.name not in ("", "..") else source.resolve()
-    return numbered(named.with_name(named.name + ending), suffix)
+    return named.with_name(named.name + ending)
 
 
 def check_output_folder(out: Path, inputs: list[Path], overwrite: bool) -> None:

@@ -7,7 +7,7 @@ import tyro
 from pydantic import ValidationError
 
 from rmis_calib.cli import EXIT_OK
-from rmis_calib.cli.console import ProgressCallback, conclude, print_table, progress_reporter, say
+from rmis_calib.cli.console import ProgressCallback, conclude, print_table, progress_reporter, say, summarise_result
 from rmis_calib.cli.estimates import Estimates
 from rmis_calib.cli.paths import check_output_folder
 from rmis_calib.errors import InputError, OutputError
@@ -64,9 +64,9 @@ class Demo(Estimates):
             result = calibrate_to_folder(
                 description, calibration, self.resolved(), overwrite=self.overwrite, progress=progress
             )
-        code = conclude(result, calibration / "report.html")
+        conclude(result)
         print_table("against the truth of the rendering", evaluate(result, recording).rows())
-        return code
+        return summarise_result(f"demo {self.out}", result, calibration / "report.html")
 
 
 def render_recording(

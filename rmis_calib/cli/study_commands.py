@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bars
 
-from rmis_calib.cli import EXIT_BAD_INPUT, EXIT_NOT_TRUSTWORTHY, EXIT_OK
-from rmis_calib.cli.console import LOG_INTERVAL_S, say, time_left
+from rmis_calib.cli import EXIT_BAD_INPUT, EXIT_NOT_TRUSTWORTHY, EXIT_OK, help_page
+from rmis_calib.cli.console import LOG_INTERVAL_S, say, summarise, time_left
 from rmis_calib.cli.usage import parse_arguments
 from rmis_calib.errors import InputError
 from rmis_calib.io.configs import did_you_mean
@@ -153,9 +153,9 @@ def parse_study(argv: Sequence[str]) -> Any:
         SystemExit: help was asked for, and printed.
         InputError: no such study, or a word that is not understood.
     """
-    if not argv or argv[0] in ("-h", "--help"):
-        print(_overview())
-        raise SystemExit(EXIT_OK if argv else EXIT_BAD_INPUT)
+    if not argv:
+        print(help_page("study"), end="")
+        raise SystemExit(EXIT_BAD_INPUT)
     name = argv[0]
     if name not in STUDIES:
         found = f"{name!r}{did_you_mean(name, list(STUDIES))}"
@@ -166,12 +166,6 @@ def parse_study(argv: Sequence[str]) -> Any:
     except InputError as error:
         where = re.sub(r"^--(run|setup|pictures)\.", "--", error.where)  # the flags have no groups in their names
         raise InputError(where=where, expected=error.expected, found=error.found) from None
-
-
-def _overview() -> str:
-    lines = ["usage: rmis-calib study NAME [OPTIONS]     (rmis-calib study NAME --help for its options)", ""]
-    lines += [f"  {name:<13} {sentence}" for name, (_, sentence) in STUDIES.items()]
-    return "\n".join([*lines, "", "--quick: under a minute; without it, minutes to half an hour on two cores"])
 
 
 @contextmanager
@@ -214,7 +208,7 @@ def conclude_study(result: "StudyResult") -> int:
         _print_table(table)
     for sentence in result.sentences:
         say(sentence)
-    say(f"written: {result.page}")
+    summarise(f"study {result.kind}", *result.sentences[:1], f"written to {result.page}")
     return EXIT_OK if result.reached else EXIT_NOT_TRUSTWORTHY
 
 

@@ -21,6 +21,20 @@ FormatName = Literal[
     "tum",
     "urdf-origin",
 ]
+SUFFIXES: dict[FormatName, str] = {
+    "csv": ".csv",
+    "dvrk": "",
+    "easy-handeye2": ".calib",
+    "ethz": ".json",
+    "moveit": ".launch",
+    "opencv-json": ".json",
+    "opencv-yaml": ".yaml",
+    "ros-static-tf": "",
+    "surgsync": "",
+    "tum": ".txt",
+    "urdf-origin": ".urdf",
+}
+"""How a file of each format ends by default; folders have no ending."""
 FORMAT_NAMES: tuple[FormatName, ...] = get_args(FormatName)
 
 AXES_IN_WORDS: dict[Axes, str] = {
