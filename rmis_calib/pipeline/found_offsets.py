@@ -9,7 +9,7 @@ from rmis_calib.io import Recording
 from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
 from rmis_calib.pipeline.poses import MotionPoses, motion_poses
 from rmis_calib.results import KinematicOffsets
-from rmis_calib.solver.model.residuals import rcm_axes
+from rmis_calib.solver.model.predicted_shaft import rcm_axes
 
 
 def poses_at(recording: Recording, offsets: KinematicOffsets, device: str = "cpu") -> MotionPoses:
@@ -71,7 +71,7 @@ def with_found_bases(recording: Recording, offsets: KinematicOffsets) -> Recordi
 
 
 def with_rcm_offset(poses: MotionPoses, rcm_mm: tuple[float, float]) -> MotionPoses:
-    """The poses with the shaft's axis moved off the nominal RCM, along the directions of `residuals.rcm_axes`."""
+    """The poses with the shaft's axis moved off the nominal RCM, along the directions of `predicted_shaft.rcm_axes`."""
     if not any(rcm_mm):
         return poses
     arm_R_rcm = poses.arm_T_rcm[:, :3, :3]

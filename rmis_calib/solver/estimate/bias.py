@@ -26,14 +26,9 @@ from rmis_calib.geometry.rotations import rotvec_to_matrix
 from rmis_calib.solver.model.batched_linalg import cross, dot, unit
 from rmis_calib.solver.model.measurement_rows import LINE, MeasurementRows
 from rmis_calib.solver.model.normal_equations import NoiseModel, WeightedModel, image_variance, normal_equations
-from rmis_calib.solver.model.residuals import (
-    Shaft,
-    _line_geometry,
-    corrected_points,
-    own_rows,
-    predict_shaft,
-    shaft_poses,
-)
+from rmis_calib.solver.model.own_rows import own_rows, shaft_poses
+from rmis_calib.solver.model.predicted_shaft import Shaft, predict_shaft
+from rmis_calib.solver.model.residuals import _line_geometry, corrected_points
 from rmis_calib.solver.model.state import State
 
 SIMULATED_PART = 16

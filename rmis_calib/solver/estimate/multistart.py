@@ -12,7 +12,7 @@ from rmis_calib.solver.estimate.outliers import anneal, chi2_quantile, truncated
 from rmis_calib.solver.model.measurement_rows import MeasurementRows
 from rmis_calib.solver.model.normal_equations import NoiseModel, WeightedModel, camera_distance2
 from rmis_calib.solver.model.parameters import NuisancePriors, initial_state, make_layout
-from rmis_calib.solver.model.residuals import predict_shaft
+from rmis_calib.solver.model.predicted_shaft import predict_shaft
 from rmis_calib.solver.model.state import State
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import SolverSettings

@@ -20,10 +20,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rmis_calib.solver.model.batched_linalg import rescaled, unit_diagonal
+from rmis_calib.solver.model.linearised_rows import LinearisedRows
 from rmis_calib.solver.model.measurement_rows import END, HEAD, LINE, MeasurementRows
 from rmis_calib.solver.model.normal_equations import NoiseModel, WeightedModel, accumulate, covariance, image_variance
 from rmis_calib.solver.model.parameters import ParameterLayout, columns
-from rmis_calib.solver.model.residuals import LinearisedRows, linearise
+from rmis_calib.solver.model.residuals import linearise
 from rmis_calib.solver.model.state import State
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import NoiseSettings

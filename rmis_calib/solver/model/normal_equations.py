@@ -17,9 +17,11 @@ from torch import Tensor
 
 from rmis_calib.errors import InputError
 from rmis_calib.solver.model.batched_linalg import eliminate, forward_substitute
+from rmis_calib.solver.model.linearised_rows import LinearisedRows
 from rmis_calib.solver.model.measurement_rows import END, HEAD, LINE, OWN, MeasurementRows
 from rmis_calib.solver.model.parameters import ParameterLayout, columns
-from rmis_calib.solver.model.residuals import LinearisedRows, Shaft, linearise
+from rmis_calib.solver.model.predicted_shaft import Shaft
+from rmis_calib.solver.model.residuals import linearise
 from rmis_calib.solver.model.state import State
 
 

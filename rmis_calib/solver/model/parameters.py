@@ -11,8 +11,10 @@ from rmis_calib.errors import InputError
 from rmis_calib.geometry.rigid import rigid_inverse, rigid_log
 from rmis_calib.solver.model.batched_linalg import add_cross_, batch_last, cross, dot, rotate
 from rmis_calib.solver.model.compliance import COUNT, FUNCTIONS, SHIFTS, TURNS, basis
+from rmis_calib.solver.model.linearised_rows import LinearisedRows
 from rmis_calib.solver.model.measurement_rows import LINE, MeasurementRows, line_points
-from rmis_calib.solver.model.residuals import LinearisedRows, Shaft, intrinsic_effects, rcm_axes
+from rmis_calib.solver.model.predicted_shaft import Shaft, rcm_axes
+from rmis_calib.solver.model.residuals import intrinsic_effects
 from rmis_calib.solver.model.state import State
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import NoiseSettings, UnknownSettings

@@ -49,135 +49,18 @@ from torch import Tensor
 
 from rmis_calib.errors import InputError
 from rmis_calib.geometry.cameras import corrected_point
-from rmis_calib.geometry.rotations import rotvec_to_matrix
-from rmis_calib.solver.model.batched_linalg import cross, dot, rotate_trials, unit
-from rmis_calib.solver.model.compliance import FUNCTIONS, basis
+from rmis_calib.solver.model.batched_linalg import cross, dot, rotate_trials
 from rmis_calib.solver.model.forward_mode import load_forward_mode
-from rmis_calib.solver.model.measurement_rows import MeasurementRows, OwnRows
+from rmis_calib.solver.model.linearised_rows import LinearisedRows
+from rmis_calib.solver.model.measurement_rows import MeasurementRows
+from rmis_calib.solver.model.own_rows import own_rows, shaft_poses, with_own_rows
+from rmis_calib.solver.model.predicted_shaft import Shaft, camera_poses, matters, predict_shaft, shaft_at
 from rmis_calib.solver.model.state import State
 
 MAX_SINE = 0.99
 """Clamp of r/D. A shaft nearer than that would touch the lens; only trial steps get there."""
 MIN_COSINE = 1e-6
 """Smallest T and X_u divided by: a ray along the axis meets it nowhere."""
-
-
-@dataclass(frozen=True)
-class Shaft:
-    """Predicted shaft in every camera's frame, component first: p, d, m, u (3, c, b, n), D and s0 (c, b, n)."""
-
-    p: Float[Tensor, "3 c b n"]
-    d: Float[Tensor, "3 c b n"]
-    m: Float[Tensor, "3 c b n"]
-    u: Float[Tensor, "3 c b n"]
-    D: Float[Tensor, "c b n"]
-    s0: Float[Tensor, "c b n"]
-    head: Float[Tensor, "3 c b n"]
-
-
-@dataclass(frozen=True)
-class LinearisedRows:
-    """Residuals and first-order effects of a rigid motion of the shaft, in `camera_right`; rows of absent
-    measurements are zero.
-
-    Attributes:
-        r: residuals, normalised image units.
-        w: effect of a translation of the shaft.
-        a: effect of a rotation of the shaft about the RCM.
-        radius: effect of the radius.
-        end: effect of the end offset.
-    """
-
-    r: Float[Tensor, "k b n"]
-    w: Float[Tensor, "3 k b n"]
-    a: Float[Tensor, "3 k b n"]
-    radius: Float[Tensor, "k b n"]
-    end: Float[Tensor, "k b n"]
-
-
-def camera_poses(measured: MeasurementRows, state: State) -> tuple[Float[Tensor, "b c 3 3"], Float[Tensor, "b c 3"]]:
-    """`camera_T_camera_right` of the state."""
-    R, t = measured.camera_R.permute(3, 2, 0, 1), measured.camera_t.permute(2, 1, 0)
-    if measured.cameras == 2:
-        R, t = torch.stack((R[:, 0], state.stereo_R), dim=1), torch.stack((t[:, 0], state.stereo_t), dim=1)
-    return R, t
-
-
-def rcm_axes(
-    R: Float[Tensor, "3 3 ..."], v: Float[Tensor, "3 ..."]
-) -> tuple[Float[Tensor, "3 ..."], Float[Tensor, "3 ..."]]:
-    """Two unit directions across the shaft, fixed to `rcm`, in `arm`: the axis of `rcm` that follows the one nearest to
-    the shaft (x, y, z, x) made perpendicular to it, and the shaft times that.
-
-    The offset is one constant only while the choice stays the same: while the shaft keeps within 45 degrees of one
-    axis. (To compare the two axes that lie across the shaft instead changes the choice from motion to motion.)
-
-    Args:
-        R: `arm_R_rcm`.
-        v: direction of the shaft, in `arm`.
-    """
-    along = torch.stack([dot(R[:, i], v).abs() for i in range(3)])
-    nearest = along.argmax(0)
-    axis = torch.where(nearest == 2, R[:, 0], torch.where(nearest == 0, R[:, 1], R[:, 2]))
-    e1 = unit(axis - dot(axis, v) * v)
-    return e1, cross(v, e1)
-
-
-def predict_shaft(measured: MeasurementRows, state: State) -> Shaft:
-    """The shaft in the frame of each camera."""
-    arm_p, arm_v, arm_head, _ = _corrected(measured, state)
-    camera_R, camera_t = camera_poses(measured, state)
-    R = camera_R @ state.R[:, None]
-    t = (camera_R @ state.t[:, None, :, None])[..., 0] + camera_t
-    p = rotate_trials(R, arm_p) + t.permute(2, 1, 0)[..., None]
-    d = rotate_trials(R, arm_v)
-    return _shaft(p, d, rotate_trials(R, arm_head) if measured.has_heads else d)
-
-
-def _shaft(p: Float[Tensor, "3 c b n"], d: Float[Tensor, "3 c b n"], head: Float[Tensor, "3 c b n"]) -> Shaft:
-    M = cross(p, d)
-    D = dot(M, M).sqrt().clamp_min(1e-9)
-    s0 = dot(p, d)
-    return Shaft(p=p, d=d, m=M / D, u=torch.addcmul(p, s0, d, value=-1.0) / D, D=D, s0=s0, head=head)
-
-
-def _corrected(measured: MeasurementRows, state: State) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """RCM, direction and head vector in `arm` with the estimated offsets applied, to first order in the rotation; and
-    that rotation."""
-    p, v, head = measured.p, measured.v, measured.head
-    if _matters(state.rcm_offset):
-        e1, e2 = rcm_axes(measured.R, measured.v)
-        p = p + state.rcm_offset[:, 0, None] * e1 + state.rcm_offset[:, 1, None] * e2
-    displacement = None
-    if measured.joint is not None and _matters(state.joint_offset):
-        displacement = (measured.joint * state.joint_offset.T[:, :, None]).sum(1)
-    if measured.clock is not None and _matters(state.clock):
-        moved = measured.clock * state.clock[:, None]
-        displacement = moved if displacement is None else displacement + moved
-    if measured.setup is not None and _matters(state.setup):
-        moved = (measured.setup * state.setup.T[:, :, None]).sum(1)
-        displacement = moved if displacement is None else displacement + moved
-    if _matters(state.compliance):
-        moved = _given_way(measured, state)
-        displacement = moved if displacement is None else displacement + moved
-    if displacement is not None:
-        p = p + displacement[3:]
-        v = unit(v + cross(displacement[:3], v))
-        head = head + cross(displacement[:3], head)
-    return p, v, head, torch.zeros_like(p) if displacement is None else displacement[:3]
-
-
-def _given_way(measured: MeasurementRows, state: State) -> Float[Tensor, "6 b n"]:
-    """Displacement of the shaft by what the arm gives way, in `arm`."""
-    coefficient = state.compliance.unflatten(-1, (-1, FUNCTIONS)).permute(1, 2, 0)[..., None]  # (component, f, b, 1)
-    turn1, turn2, shift1, shift2, along = (coefficient * basis(measured.pose)).sum(1)
-    e1, e2 = rcm_axes(measured.R, measured.v)
-    return torch.cat((turn1 * e1 + turn2 * e2, shift1 * e1 + shift2 * e2 + along * measured.v))
-
-
-def _matters(offset: Tensor) -> bool:
-    """Whether an offset has an effect, or a derivative."""
-    return offset.requires_grad or bool((offset != 0).any())
 
 
 def residual_rows(measured: MeasurementRows, state: State) -> Float[Tensor, "k b n"]:
@@ -206,7 +89,7 @@ def linearise(measured: MeasurementRows, state: State) -> tuple[LinearisedRows, 
     shaft = predict_shaft(measured, state)
     built_in = _linearise_by_autograd if measured.autograd else _linearise_analytically
     linear = built_in(measured, state, shaft)
-    return _with_own(linear, measured, state, shaft) if measured.own else linear, shaft
+    return with_own_rows(linear, measured, state, shaft) if measured.own else linear, shaft
 
 
 def _linearise_analytically(measured: MeasurementRows, state: State, shaft: Shaft) -> LinearisedRows:
@@ -269,7 +152,7 @@ def _linearise_by_autograd(measured: MeasurementRows, state: State, shaft: Shaft
 
     def rows(step: Float[Tensor, "8 b"]) -> Float[Tensor, "k b n"]:
         tau, phi = rotate_trials(camera_R, step[:3, :, None]), rotate_trials(camera_R, step[3:6, :, None])
-        moved = _shaft(p + tau, d + cross(phi, d), head + cross(phi, head))
+        moved = shaft_at(p + tau, d + cross(phi, d), head + cross(phi, head))
         return _rows(many, replace(at, radius=at.radius + step[6], end_offset=at.end_offset + step[7]), moved)
 
     with torch.inference_mode(False), torch.no_grad(), forward_ad.dual_level():
@@ -282,61 +165,10 @@ def _linearise_by_autograd(measured: MeasurementRows, state: State, shaft: Shaft
     return LinearisedRows(r, effect[:3], effect[3:6], effect[6], effect[7])
 
 
-def _with_own(linear: LinearisedRows, measured: MeasurementRows, state: State, shaft: Shaft) -> LinearisedRows:
-    """The rows with those of the user's own measurements, whose effects come from forward-mode autograd: six steps of
-    the shaft side by side, three of a translation and three of a rotation about the RCM, in `camera_right`."""
-    camera_R, _ = camera_poses(measured, state)
-    parts = {name: [getattr(linear, name)] for name in ("r", "w", "a", "radius", "end")}
-    on_graph = torch.is_grad_enabled() and not torch.is_inference_mode_enabled()
-    load_forward_mode()
-    for rows in measured.own:
-        R, t = shaft_poses(rows, measured, state)
-        axes = camera_R[:, rows.camera].permute(2, 0, 1)  # those of `camera_right`, (3, b, 3)
-        axes = axes[:, :, None].expand(3, *t.shape)
-        p = shaft.p[:, rows.camera].permute(1, 2, 0)
-        dR = torch.cat((R.new_zeros((3, *R.shape)), torch.linalg.cross(axes[..., None], R.expand(3, *R.shape), dim=-2)))
-        dt = torch.cat((axes, torch.linalg.cross(axes, (t - p).expand(3, *t.shape), dim=-1)))
-        values = {key: value.movedim((-2, -1), (0, 1)) for key, value in rows.values.items()}
-        with torch.inference_mode(False), torch.set_grad_enabled(on_graph), forward_ad.dual_level():
-            many_R = forward_ad.make_dual(R.expand(6, *R.shape).clone(), dR.clone())
-            many_t = forward_ad.make_dual(t.expand(6, *t.shape).clone(), dt.clone())
-            value, effect = forward_ad.unpack_dual(rows.residual(many_R, many_t, **values))
-        if effect is None:
-            raise InputError(where="own measurement", expected="a residual that depends on the transform", found="none")
-        r = value[0].movedim(-1, 0) + rows.shift
-        effect = torch.where(rows.ok, effect.movedim(-1, 1), 0.0)
-        zero = torch.zeros_like(r)
-        found = {"r": torch.where(rows.ok, r, 0.0), "w": effect[:3], "a": effect[3:], "radius": zero, "end": zero}
-        for name, value in found.items():
-            parts[name].append(rows.among(measured.cameras, value))
-    return LinearisedRows(**{name: torch.cat(part, dim=-3) for name, part in parts.items()})
-
-
 def _into_right(camera_R: Float[Tensor, "b c 3 3"], v: Float[Tensor, "3 m c b n"]) -> Float[Tensor, "3 m c b n"]:
     """Vectors of each camera's frame turned into `camera_right`."""
     back = camera_R.permute(1, 0, 3, 2).expand(v.shape[1], -1, -1, -1, -1).flatten(0, 2)
     return torch.matmul(back, v.flatten(1, 3).transpose(0, 1)).transpose(0, 1).unflatten(1, v.shape[1:4])
-
-
-def own_rows(rows: OwnRows, R: Float[Tensor, "b n 3 3"], t: Float[Tensor, "b n 3"]) -> Float[Tensor, "m b n"]:
-    """Residuals of one measurement of the user's own, from `shaft_poses`."""
-    values = {key: value.movedim((-2, -1), (0, 1)) for key, value in rows.values.items()}
-    return rows.residual(R, t, **values).movedim(-1, 0) + rows.shift
-
-
-def shaft_poses(
-    rows: OwnRows, measured: MeasurementRows, state: State
-) -> tuple[Float[Tensor, "b n 3 3"], Float[Tensor, "b n 3"]]:
-    """`camera_T_arm` for every motion, by which what `arm` tells of the instrument comes to be where the offsets move
-    it: x -> p' + exp(phi) (x - p), for a displacement of the shaft that takes the RCM from p to p'."""
-    p, _, _, phi = _corrected(measured, state)
-    camera_R, camera_t = (x[:, rows.camera] for x in camera_poses(measured, state))
-    R = camera_R @ state.R
-    t = (camera_R @ state.t[..., None])[..., 0] + camera_t
-    before, after, turn, first = (x.permute(1, 2, 0) for x in (measured.p - rows.moved, p, phi, rows.turn))
-    turned = rotvec_to_matrix(turn) @ rotvec_to_matrix(first)
-    shift = after - (turned @ before[..., None])[..., 0]
-    return R[:, None] @ turned, (R[:, None] @ shift[..., None])[..., 0] + t[:, None]
 
 
 @dataclass(frozen=True)
@@ -366,7 +198,7 @@ def _line_geometry(measured: MeasurementRows, state: State, shaft: Shaft, radius
     n_xy = _held(measured, n_image.square().sum(0).sqrt().clamp_min(1e-12))
     X_m, X_u, X_d = (_along(axis, x, y) for axis in (shaft.m, shaft.u, shaft.d))
     f = torch.addcmul(cosine * X_m, sine, X_u) / n_xy
-    if _matters(state.edge_bias):
+    if matters(state.edge_bias):
         f = f + state.edge_bias.permute(1, 2, 0)[..., None]
     kappa = torch.addcmul(cosine * X_u, sine, X_m, value=-1.0) / (shaft.D * cosine * n_xy)
     return LineGeometry(f, sine, cosine, kappa, X_d / n_xy - kappa * shaft.s0, n_image / n_xy)
@@ -374,7 +206,7 @@ def _line_geometry(measured: MeasurementRows, state: State, shaft: Shaft, radius
 
 def corrected_points(xy: Float[Tensor, "2 *k c b n"], state: State) -> Float[Tensor, "2 *k c b n"]:
     """Image points once each camera's intrinsics are corrected by the state's (`cameras.corrected_point`)."""
-    if not _matters(state.intrinsics):
+    if not matters(state.intrinsics):
         return xy
     changes = state.intrinsics.permute(2, 1, 0)[..., None].unbind()  # four of (c, b, 1)
     return torch.stack(corrected_point(*xy.unbind(), *changes))
