@@ -147,7 +147,7 @@ class ShaftDetector:
         offered = edges.at_stations(trace.sides, trace.t, points.t)
         share = (fit.inliers / offered.sum(-1).clamp(min=1)).amin(-1)
         reach = math.hypot(*images.shape[-2:])
-        certain = confidence.cap_one_sided(confidence.probability(confidence.features(trace, fit, share, reach)), trace)
+        certain = confidence.capped(confidence.probability(confidence.features(trace, fit, share, reach)), trace)
         convergence = (fit.slope[..., 0] - fit.slope[..., 1]).abs()
         cylinder = convergence < math.tan(math.radians(self.settings.max_convergence_deg))
         clear = cylinder & (share > 0.15) & ((scores > 0) & ~broken[:, None])[keep] & (fit.spread_t.amin(-1) > 0)

@@ -28,6 +28,9 @@ white and bare metal instruments, less tinted than tissue as well, start at 0.6.
 # A wrist of bare metal lies about half-way between shaft and tissue (0.5 to 0.7 in both da Vinci and grasper pictures);
 # shading along a shaft stays below 0.25.
 _SHAFT_SHARE = 0.38
+# A column of squares alternates over half of its way, half of one that something hides over a fifth; shafts of the real
+# frames and of all presets over less than a twentieth, for the wrist of bare metal over something dark.
+_LEAST_ALTERNATION = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +60,9 @@ class Evidence:
     """Median over the shaft of the weaker contour's step."""
     purity: Float[Tensor, "b k"]
     """How much of the inside is shaft and how much of the surroundings is not, 0 to 1."""
+    alternation: Float[Tensor, "b k"]
+    """How much of the way between its first and its last stretch changes tones with what lies beside it, 0 to 1: the
+    squares of a chessboard do, and one thing does not."""
 
     def pick(self, index: Tensor) -> "Evidence":
         """The strips with these indices, (b, k') int64."""
@@ -80,6 +86,7 @@ class _Profiles:
     inner: Float[Tensor, "b k s"]
     outer: Float[Tensor, "b k s"]
     step: Float[Tensor, "b k s"]
+    brighter_side: Float[Tensor, "b k s"]
     purity: Float[Tensor, "b k s"]
     open: Bool[Tensor, "b k s"]
     both: Bool[Tensor, "b k s"]
@@ -125,7 +132,7 @@ def _profiles(picture: SmallPicture, strips: Strips, t: Float[Tensor, " s"], nar
     centre_seen = seen[:, :, _INNER // 2]
     brighter = third_lowest(tone[:, :, :_INNER]) - 0.5 * (tone[:, :, _INNER] + tone[:, :, _INNER + 3])
     is_open = centre_seen & one_side & (width > narrowest_px) & strips.valid[..., None] & (brighter < MAX_BRIGHTER)
-    return _Profiles(inner, outer, step, purity, is_open, both_sides, centre_seen, width)
+    return _Profiles(inner, outer, step, brighter_side, purity, is_open, both_sides, centre_seen, width)
 
 
 def _glare(tint: Float[Tensor, "b k n s"], tone: Float[Tensor, "b k n s"]) -> Bool[Tensor, "b k n s"]:
@@ -175,6 +182,7 @@ def inspect(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -
     carries_end = on & (length > settings.end_run_widths * width[..., None])
     carries_end = torch.where(carries_end.any(-1, keepdim=True), carries_end, on)
 
+    alternation = _alternation(p, on, tone, surround)
     reach = 0.5 * width + 3 * spacing
     contoured = edged & run_any(bridge(edged, 0.7 * width / spacing), on)
     low_gap = first_on(t, contoured) - first_on(t, p.seen)
@@ -196,7 +204,23 @@ def inspect(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -
         paired_length=(on & p.both).float().sum(-1) * spacing,
         contrast=masked_median(p.step, on),
         purity=masked_mean(p.purity, on),
+        alternation=alternation,
     )
+
+
+def _alternation(
+    p: _Profiles, on: Bool[Tensor, "b k s"], tone: Float[Tensor, "b k"], surround: Float[Tensor, "b k"]
+) -> Float[Tensor, "b k"]:
+    """`Evidence.alternation`: stations as bright as the surroundings, with a side as dark as the shaft.
+
+    Beyond the last stretch, where the wrist of bare metal may lie over something dark, both sides have to be.
+    """
+    step = (surround - tone).clamp(min=0.0)[..., None]
+    bright, dark = p.inner > tone[..., None] + 0.6 * step, tone[..., None] + 0.4 * step
+    between = (on.cumsum(-1) > 0) & (on.flip(-1).cumsum(-1).flip(-1) > 0)
+    changed = bright & p.seen & ((between & (p.outer < dark)) | (p.both & (p.brighter_side < dark)))
+    exchanged = changed.sum(-1)
+    return exchanged / (exchanged + on.sum(-1)).clamp(min=1)
 
 
 def score(evidence: Evidence, settings: DetectorSettings) -> Float[Tensor, "b k"]:
@@ -206,7 +230,9 @@ def score(evidence: Evidence, settings: DetectorSettings) -> Float[Tensor, "b k"
     long_enough = (evidence.length > settings.min_aspect * evidence.width) & (
         evidence.paired_length > 0.5 * settings.min_aspect * evidence.width
     )
-    return evidence.length * quality * evidence.purity**2 * entering * (long_enough & evidence.strips.valid)
+    one_thing = evidence.alternation < _LEAST_ALTERNATION
+    wanted = long_enough & one_thing & evidence.strips.valid
+    return evidence.length * quality * evidence.purity**2 * entering * wanted
 
 
 def lies_on(evidence: Evidence) -> Bool[Tensor, "b k k"]:

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rmis_calib.vision.coarse.appearance import weighted_tint
+from rmis_calib.vision.coarse.borders import enter, through_the_dark, ways
 from rmis_calib.vision.coarse.contour_profiles import AxisProfile, ContourProfiles, follow, read_middle
 from rmis_calib.vision.coarse.scoring import MAX_BRIGHTER
 from rmis_calib.vision.coarse.strips import SmallPicture, Strips
@@ -70,6 +71,8 @@ class Trace:
     start_at_border: Bool[Tensor, "b k"]
     end_at_border: Bool[Tensor, "b k"]
     """Whether the shaft leaves the field of view at its start and at its end."""
+    closed: Bool[Tensor, "b k"]
+    """Between its start and the border something brighter shows: it does not come from there, or is covered."""
     width: Float[Tensor, "b k"]
     """Median width, px."""
     length: Float[Tensor, "b k"]
@@ -113,7 +116,11 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
     possible &= middle.brightness - beside < MAX_BRIGHTER  # white plastic and metal are as neutral as a shaft
     joined = _joined(t, own, same_tone, edged, on, main, possible, middle.seen, width)
     on, main = on | joined, main | joined
-    to_border, borders = _enter(t, edged | joined, main, middle.seen, width)
+    to_border, borders = enter(t, edged | joined, main, middle.seen, width)
+    way = ways(t, on, middle.seen)
+    brighter = own > (masked_median(own, edged) + same_tone)[..., None]
+    closed = (way & brighter[:, :, None]).sum(-1) > 1
+    borders = through_the_dark(way, closed, on, borders)
     on, main = on | to_border, main | to_border
     line = strips.contour(stations)
     wander = smooth_over(sides.lateral - line, (on[:, :, None] & sides.seen))
@@ -131,6 +138,7 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
         end=torch.where(torch.isfinite(ends), ends, last_on(t, carries_end | up)),
         start_at_border=borders[0],
         end_at_border=borders[1],
+        closed=closed[..., 0],
         width=width,
         length=on.float().sum(-1) * spacing,
         contrast=masked_median(torch.where(torch.isfinite(step), step, 0.0), on),
@@ -139,7 +147,7 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
         surround=surround,
     )
     low_end = torch.where(torch.isfinite(begins), begins, first_on(t, carries_end | down))
-    return _towards_tip(whole, low_end, last_on(t, on), t, middle.seen)
+    return _towards_tip(whole, low_end, last_on(t, on), closed[..., 1], t, middle.seen)
 
 
 def _plain_stretch(
@@ -286,30 +294,13 @@ def _own_tone(
     return same_shaft & steady
 
 
-def _enter(
-    t: Float[Tensor, " s"],
-    edged: Bool[Tensor, "b k s"],
-    main: Bool[Tensor, "b k s"],
-    seen: Bool[Tensor, "b k s"],
-    width: Float[Tensor, "b k"],
-) -> tuple[Bool[Tensor, "b k s"], tuple[Bool[Tensor, "b k"], Bool[Tensor, "b k"]]]:
-    """Stretch between the shaft's plain part and the border it enters at; whether it reaches the low, the high border.
-
-    Near the scope's light a shaft may be as bright as a wrist. On the side where its contours run out of the picture it
-    is shaft all the same.
-    """
-    step = t[1] - t[0]
-    contoured = edged & run_any(bridge(edged, 0.7 * width / step), main)
-    reach = 0.5 * width + 3 * step
-    low = first_on(t, contoured) - first_on(t, seen) < reach
-    high = last_on(t, seen) - last_on(t, contoured) < reach
-    before = contoured & (t < first_on(t, main)[..., None]) & (low & ~high)[..., None]
-    after = contoured & (t > last_on(t, main)[..., None]) & (high & ~low)[..., None]
-    return before | after, (low, high)
-
-
 def _towards_tip(
-    low_to_high: Trace, low_end: Float[Tensor, "b k"], high_start: Float[Tensor, "b k"], t: Tensor, seen: Tensor
+    low_to_high: Trace,
+    low_end: Float[Tensor, "b k"],
+    high_start: Float[Tensor, "b k"],
+    high_closed: Bool[Tensor, "b k"],
+    t: Tensor,
+    seen: Tensor,
 ) -> Trace:
     """The trace walked from the border inwards: turned round where the shaft enters on the high side."""
     low, high = low_to_high.start_at_border, low_to_high.end_at_border
@@ -329,4 +320,5 @@ def _towards_tip(
         end=torch.where(flip, -low_end, low_to_high.end),
         start_at_border=torch.where(flip, high, low),
         end_at_border=torch.where(flip, low, high),
+        closed=torch.where(flip, high_closed, low_to_high.closed),
     )
