@@ -131,6 +131,8 @@ class Arm:
     shaft_frame: int = 0
     head_frame: int = 0
     head_xyz_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    shaft_reversed: bool = False
+    """The z axis of the shaft's frame points from the tip to the RCM."""
 
     def frames(self, readings: ArrayLike) -> Array:
         """Poses (..., J + 1, 4, 4) in base of the arm's base (frame 0) and of the frame after each joint, from readings
@@ -152,7 +154,7 @@ class Arm:
         base_T_rcm = frames[..., self.rcm_frame, :, :]
         rcm_T_shaft = rigid_inverse(base_T_rcm) @ frames[..., self.shaft_frame, :, :]
         rcm_T_head = rigid_inverse(base_T_rcm) @ frames[..., self.head_frame, :, :]
-        rcm_v_axis = rcm_T_shaft[..., :3, 2]
+        rcm_v_axis = -rcm_T_shaft[..., :3, 2] if self.shaft_reversed else rcm_T_shaft[..., :3, 2]
         rcm_p_head = transform_points(rcm_T_head, np.asarray(self.head_xyz_mm, dtype=np.float64))
         return Shaft(base_T_rcm, rcm_v_axis, rcm_p_head, np.einsum("...i,...i->...", rcm_v_axis, rcm_p_head))
 
@@ -187,7 +189,13 @@ def arm_to_dict(arm: Arm, *, instrument: bool) -> dict[str, Any]:
     }
     if instrument:
         head_point = {"frame": arm.head_frame, "xyz_mm": list(arm.head_xyz_mm)}
-        return entry | {"rcm_frame": arm.rcm_frame, "shaft_frame": arm.shaft_frame, "head_point": head_point}
+        reversed_ = {"shaft_reversed": True} if arm.shaft_reversed else {}
+        return (
+            entry
+            | {"rcm_frame": arm.rcm_frame, "shaft_frame": arm.shaft_frame}
+            | reversed_
+            | {"head_point": head_point}
+        )
     return entry | {"end_T_tool": arm.end_T_tool.tolist()}
 
 
@@ -209,5 +217,6 @@ def arms_from_dict(robot: Mapping[str, Any]) -> dict[str, Arm]:
             shaft_frame=entry.get("shaft_frame", len(joints)),
             head_frame=head["frame"],
             head_xyz_mm=tuple(head["xyz_mm"]),
+            shaft_reversed=entry.get("shaft_reversed", False),
         )
     return arms

@@ -9,7 +9,7 @@ import numpy as np
 from data_synth.contours import contact_points, to_image, view_cylinder, visible_interval
 from data_synth.kinematics import Arm, Array, pose_noise, random_rotations, rigid, rigid_inverse, transform_points
 from data_synth.motion import joint_grid
-from data_synth.scene import MOVING_JOINTS, Poses, Scene, build_scene, poses_at
+from data_synth.scene import Poses, Scene, build_scene, half_range, moved_from, poses_at
 from data_synth.settings import LineStudyConfig
 
 SHORTEST_VISIBLE_MM = 10.0
@@ -113,10 +113,7 @@ def _true_poses(config: LineStudyConfig, scene: Scene, generator: np.random.Gene
 
 def _readings(config: LineStudyConfig, arm: Arm, home: Array, unit: Array) -> Array:
     """Readings (..., J) of an arm whose moving joints are off home by `unit` (..., 3) of half their range."""
-    full = {"revolute": np.deg2rad(config.rotation_range_deg), "prismatic": config.translation_range_mm}
-    out = np.broadcast_to(home, (*unit.shape[:-1], len(home))).copy()
-    out[..., :MOVING_JOINTS] += unit * (0.5 * np.array([full[joint.kind] for joint in arm.joints[:MOVING_JOINTS]]))
-    return out
+    return moved_from(home, unit * half_range(arm, config.rotation_range_deg, config.translation_range_mm))
 
 
 def _hand_eye(config: LineStudyConfig, scene: Scene, generator: np.random.Generator) -> Array:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from data_synth.kinematics import Array
-from data_synth.scene import Scene
+from data_synth.scene import MOVING_JOINTS, Scene, half_range, moved_from
 from data_synth.settings import MotionSettings
 
 MOVING_FRACTION = 0.5
@@ -32,8 +32,8 @@ class JointPath:
     """Readings of both arms as functions of time: stops with rests between, or sums of sines.
 
     Attributes:
-        centre: (6,) laparoscope's three joints, then the instrument's.
-        half_range: (6,).
+        laparoscope_home, instrument_home: (J,) readings in the middle of the motion.
+        half_range: (6,) of the laparoscope's moving joints, then of the instrument's.
         stop_times_s: (S,) middles of the rests, or empty for a smooth path.
         stops: (S, 6) in units of half_range.
         frequency_hz: (K, 6) of the sines.
@@ -41,7 +41,8 @@ class JointPath:
         amplitude: (K, 6), columns sum to at most 1.
     """
 
-    centre: Array
+    laparoscope_home: Array
+    instrument_home: Array
     half_range: Array
     stop_times_s: Array
     stops: Array
@@ -50,10 +51,16 @@ class JointPath:
     amplitude: Array
 
     def at(self, times_s: Array) -> tuple[Array, Array]:
-        """Readings of the laparoscope (..., 3) and of the instrument (..., 3) at times (...)."""
-        unit = self._stopping(times_s) if len(self.stop_times_s) else self._smooth(times_s)
-        readings = self.centre + self.half_range * unit
-        return readings[..., :3], readings[..., 3:]
+        """Readings of the laparoscope (..., J) and of the instrument (..., J) at times (...)."""
+        return self.readings(self._stopping(times_s) if len(self.stop_times_s) else self._smooth(times_s))
+
+    def readings(self, unit: Array) -> tuple[Array, Array]:
+        """Readings of both arms (..., J) whose moving joints are off home by `unit` (..., 6) of half their range."""
+        change = self.half_range * unit
+        return (
+            moved_from(self.laparoscope_home, change[..., :MOVING_JOINTS]),
+            moved_from(self.instrument_home, change[..., MOVING_JOINTS:]),
+        )
 
     def _stopping(self, times_s: Array) -> Array:
         if len(self.stop_times_s) == 1:
@@ -80,35 +87,35 @@ def plan_path(
         scene: for the home positions.
         frames: number of frames.
         generator: source of randomness.
-        in_view: whether the shaft's end is in view at readings (n, 3), (n, 3); used by `random` when
+        in_view: whether the shaft's end is in view at readings (n, J) of each arm; used by `random` when
             `keep_end_in_view`.
     """
-    arm_half = 0.5 * np.array([np.deg2rad(settings.rotation_range_deg)] * 2 + [settings.translation_range_mm])
-    half_range = np.concatenate([arm_half * (settings.laparoscope == "moving"), arm_half])
-    centre = np.concatenate([scene.laparoscope_home, scene.instrument_home])
+    ranges = settings.rotation_range_deg, settings.translation_range_mm
+    laparoscope = half_range(scene.laparoscope, *ranges) * (settings.laparoscope == "moving")
+    none = np.zeros((0, 6))
+    still = JointPath(
+        scene.laparoscope_home, scene.instrument_home,
+        np.concatenate([laparoscope, half_range(scene.instrument, *ranges)]), np.zeros(0), none, none, none, none,
+    )  # fmt: skip
     if settings.kind == "smooth":
-        path = _smooth_path(centre, half_range, settings.speed, generator)
-        return path, START_S + np.arange(frames) / settings.frame_rate_hz
+        return _smooth(still, settings.speed, generator), START_S + np.arange(frames) / settings.frame_rate_hz
 
     def good(unit: Array) -> Array:
-        readings = centre + half_range * unit
-        return in_view(readings[:, :3], readings[:, 3:])
+        return in_view(*still.readings(unit))
 
     make = _grid_stops if settings.kind == "grid" else _random_stops
     stops = make(settings, frames, generator, good)
     times = START_S + (np.arange(frames) + 0.5) * settings.stop_period_s
-    none = np.zeros((0, 6))
-    return JointPath(centre, half_range, times, stops, none, none, none), times
+    return replace(still, stop_times_s=times, stops=stops), times
 
 
-def _smooth_path(centre: Array, half_range: Array, speed: float, generator: np.random.Generator) -> JointPath:
+def _smooth(still: JointPath, speed: float, generator: np.random.Generator) -> JointPath:
     """Three incommensurable sines a joint, below 0.4 Hz: hand speeds of a few centimetres a second."""
     frequency = speed * generator.uniform(0.05, 0.4, (3, 6)) * np.array([1.0, 0.6, 0.35])[:, None]
     amplitude = generator.uniform(0.5, 1.0, (3, 6))
     amplitude /= amplitude.sum(0)
-    none = np.zeros((0, 6))
     phase = generator.uniform(0.0, 2.0 * np.pi, (3, 6))
-    return JointPath(centre, half_range, np.zeros(0), none, frequency, phase, amplitude)
+    return replace(still, frequency_hz=frequency, phase_rad=phase, amplitude=amplitude)
 
 
 def _grid_stops(

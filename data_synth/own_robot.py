@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from data_synth.kinematics import Arm, Array, rigid
@@ -23,12 +25,10 @@ def scene_with_arms(settings: SceneSettings, laparoscope: Arm, instrument: Arm) 
     lap_home = _home(laparoscope, settings.laparoscope_rcm_behind_mm + CAMERA_T_END[2, 3], _distance_of_end)
     rcm, target = np.asarray(settings.instrument_rcm_mm, float), np.asarray(settings.target_mm, float)
     tool_home = _home(instrument, float(np.linalg.norm(target - rcm)), lambda arm, q: arm.shaft(q).rcm_s_end_mm)
-    placed = Arm(
-        place_arm(laparoscope.joints, lap_home, plain.base_T_camera_home @ CAMERA_T_END, laparoscope.convention),
-        laparoscope.joints, laparoscope.convention, laparoscope.end_T_tool,
-    )  # fmt: skip
+    base_T_end = plain.base_T_camera_home @ CAMERA_T_END
+    place = place_arm(laparoscope.joints, lap_home, base_T_end, laparoscope.convention)
     return Scene(
-        laparoscope=placed,
+        laparoscope=replace(laparoscope, base_T_arm_base=place),
         instrument=_through(instrument, tool_home, plain.base_T_camera_home, rcm, target),
         laparoscope_home=lap_home,
         instrument_home=tool_home,
@@ -64,16 +64,10 @@ def _home(arm: Arm, distance_mm: float, measure) -> Array:
 
 def _through(arm: Arm, home: Array, base_T_camera: Array, camera_p_rcm: Array, camera_p_target: Array) -> Arm:
     """The instrument's arm, placed so that its RCM is at one point and its shaft points to the other."""
-    own = Arm(
-        np.eye(4), arm.joints, arm.convention, arm.end_T_tool, arm.rcm_frame, arm.shaft_frame, arm.head_frame,
-        arm.head_xyz_mm,
-    ).shaft(home)  # fmt: skip
+    own = replace(arm, base_T_arm_base=np.eye(4)).shaft(home)
     arm_base_p_rcm = own.base_T_rcm[:3, 3]
     arm_base_v_axis = own.base_T_rcm[:3, :3] @ own.rcm_v_axis
     camera_R_shaft = frame_along(camera_p_target - camera_p_rcm, roll_rad=-0.9)
     camera_R_arm_base = camera_R_shaft @ frame_along(arm_base_v_axis, roll_rad=0.0).T
     camera_T_arm_base = rigid(camera_R_arm_base, camera_p_rcm - camera_R_arm_base @ arm_base_p_rcm)
-    return Arm(
-        base_T_camera @ camera_T_arm_base, arm.joints, arm.convention, arm.end_T_tool, arm.rcm_frame, arm.shaft_frame,
-        arm.head_frame, arm.head_xyz_mm,
-    )  # fmt: skip
+    return replace(arm, base_T_arm_base=base_T_camera @ camera_T_arm_base)

@@ -52,7 +52,7 @@ class Scene:
         arms = {"laparoscope": arm_to_dict(self.laparoscope, instrument=False)} if laparoscope else {}
         return {
             "name": name,
-            "dh_convention": "modified",
+            "dh_convention": self.instrument.convention,
             "arms": arms | {"instrument": arm_to_dict(self.instrument, instrument=True)},
         }
 
@@ -134,6 +134,19 @@ def _instrument(settings: SceneSettings, base_T_camera_home: Array) -> tuple[Arm
     return Arm(base_T_arm_base, joints, rcm_frame=0, shaft_frame=3, head_frame=3, head_xyz_mm=head), home
 
 
+def half_range(arm: Arm, rotation_range_deg: float, translation_range_mm: float) -> Array:
+    """How far (3,) the moving joints of an arm go to either side of home, rad or mm."""
+    full = {"revolute": np.deg2rad(rotation_range_deg), "prismatic": translation_range_mm}
+    return 0.5 * np.array([full[joint.kind] for joint in arm.joints[:MOVING_JOINTS]])
+
+
+def moved_from(home: Array, change: Array) -> Array:
+    """Readings (..., J) of an arm whose moving joints are off home (J,) by `change` (..., 3)."""
+    out = np.broadcast_to(home, (*change.shape[:-1], len(home))).copy()
+    out[..., :MOVING_JOINTS] += change
+    return out
+
+
 @dataclass(frozen=True)
 class Poses:
     """What the joint readings say (...: any batch): poses (..., 4, 4), axis and head point (..., 3), nominal shaft end
@@ -147,7 +160,7 @@ class Poses:
 
 
 def poses_at(scene: Scene, laparoscope_readings: Array, instrument_readings: Array) -> Poses:
-    """Forward kinematics of both arms at readings (..., 3)."""
+    """Forward kinematics of both arms at readings (..., J) of each."""
     base_T_arm = scene.laparoscope.tool(laparoscope_readings)
     shaft = scene.instrument.shaft(instrument_readings)
     return Poses(

@@ -91,10 +91,11 @@ class World:
         return seen
 
 
-def build_world(config: SynthConfig) -> World:
-    """World of a configuration; the same seed gives the same world."""
+def build_world(config: SynthConfig, scene: Scene | None = None) -> World:
+    """World of a configuration; the same seed gives the same world. `scene`: of other arms (own_robot.py) than those of
+    the configuration."""
     generator = np.random.default_rng([config.seed, 0])
-    scene = build_scene(config.scene)
+    scene = build_scene(config.scene) if scene is None else scene
     cameras = {"right": build_camera(config.camera, config.camera.right)}
     if config.camera.left is not None:
         cameras["left"] = build_camera(config.camera, config.camera.left)

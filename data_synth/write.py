@@ -21,6 +21,7 @@ from data_synth.kinematics import Array, pose_noise, rigid_inverse
 from data_synth.motion import log_times
 from data_synth.presets import config_to_dict
 from data_synth.render import Renderer
+from data_synth.scene import Scene
 from data_synth.settings import OutputSettings, SynthConfig
 from data_synth.truth import SideTruth, side_truth
 from data_synth.world import World, build_world
@@ -32,6 +33,7 @@ def write_recording(
     path: str | Path,
     config: SynthConfig | None = None,
     *,
+    scene: Scene | None = None,
     device: str = "cpu",
     overwrite: bool = False,
     on_progress: Progress | None = None,
@@ -44,6 +46,8 @@ def write_recording(
     Args:
         path: folder to make.
         config: what to render; the defaults when None.
+        scene: of other arms than those of the configuration (own_robot.py); the configuration then tells of the robot
+            only its ranges of motion and noise.
         device: torch device that draws.
         overwrite: replace a folder that is already there, if all of it was written by this function.
         on_progress: called with (frames done, frames in all), a stereo pair counting once.
@@ -61,7 +65,7 @@ def write_recording(
     partial = target.parent / f".{target.name}.partial-{os.getpid()}"
     partial.mkdir()
     try:
-        world = build_world(config)
+        world = build_world(config, scene)
         truths = {side: side_truth(world, side) for side in world.cameras}
         _write_tables(partial, world, truths)
         _write_pictures(partial, world, device, on_progress or (lambda done, total: None))

@@ -179,7 +179,7 @@ def study_reporter() -> Iterator[Callable[["Progress"], None]]:
         whole = bars.add_task("cells", total=None, note="")
 
         def report(progress: "Progress") -> None:
-            bars.update(whole, completed=progress.done, total=max(1, progress.total), note=_how_far(progress))
+            bars.update(whole, completed=progress.share, total=1.0, note=_how_far(progress))
 
         yield report
 
@@ -189,7 +189,7 @@ def _line_reporter() -> Callable[["Progress"], None]:
 
     def report(progress: "Progress") -> None:
         nonlocal last
-        if progress.done in (0, progress.total) or time.monotonic() - last >= LOG_INTERVAL_S:
+        if not last or progress.done == progress.total or time.monotonic() - last >= LOG_INTERVAL_S:
             last = time.monotonic()
             print(_how_far(progress), file=sys.stderr, flush=True)
 
@@ -198,7 +198,7 @@ def _line_reporter() -> Callable[["Progress"], None]:
 
 def _how_far(progress: "Progress") -> str:
     stored = f" ({progress.stored} stored before)" if progress.stored else ""
-    left = "" if progress.done == progress.total else f", {time_left(progress.left_s)}"
+    left = "" if progress.done == progress.total else f", {100 * progress.share:.0f} %, {time_left(progress.left_s)}"
     return f"{progress.done} of {progress.total} cells{stored}{left}"
 
 

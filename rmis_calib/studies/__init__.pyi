@@ -7,6 +7,7 @@ from .registry import method as method
 from .registry import noise_source as noise_source
 from .reprojection import study_reprojection as study_reprojection
 from .settings import ComparisonStudySettings as ComparisonStudySettings
+from .settings import EquipmentSettings as EquipmentSettings
 from .settings import MotionsStudySettings as MotionsStudySettings
 from .settings import NoiseStudySettings as NoiseStudySettings
 from .settings import PictureSettings as PictureSettings

@@ -13,6 +13,8 @@ from rmis_calib.errors import InputError
 
 BOARD_ROTVEC = (0.35, -0.25, 0.1)
 """How the board is turned against the camera at home: tilted, so that its pose is well seen."""
+_SQUARE_OF_PICTURE = 0.051
+"""A square's side over the shorter side of the picture: nine of them are seen whole wherever the arm goes."""
 _TRIES = 10
 _WINDOW_PX = 5
 _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-4)
@@ -42,7 +44,8 @@ def measure_board(world: World, count: int, generator: np.random.Generator) -> B
     Raises:
         InputError: the board is out of sight too often.
     """
-    board, scene = Board(), world.scene
+    scene = world.scene
+    board = Board(square_mm=_square_mm(world))
     camera_home_T_centre = rigid(rotation_from_rotvec(BOARD_ROTVEC), world.config.scene.target_mm)
     centre_T_board = rigid(np.eye(3), -board.centre)
     base_T_board = scene.base_T_camera_home @ camera_home_T_centre @ centre_T_board
@@ -50,8 +53,8 @@ def measure_board(world: World, count: int, generator: np.random.Generator) -> B
     arms: list[Array] = []
     poses: dict[str, list[Array]] = {side: [] for side in renderers}
     for _ in range(_TRIES * count):
-        readings = scene.laparoscope_home + world.path.half_range[:3] * generator.uniform(-1.0, 1.0, 3)
-        base_T_arm = scene.laparoscope.tool(readings)
+        unit = np.concatenate([generator.uniform(-1.0, 1.0, 3), np.zeros(3)])
+        base_T_arm = scene.laparoscope.tool(world.path.readings(unit)[0])
         camera_right_T_board = scene.camera_right_T_arm @ rigid_inverse(base_T_arm) @ base_T_board
         measured = {}
         for side, renderer in renderers.items():
@@ -67,6 +70,13 @@ def measure_board(world: World, count: int, generator: np.random.Generator) -> B
         if len(arms) == count:
             return BoardPoses(np.stack(arms), {side: np.stack(list_) for side, list_ in poses.items()})
     raise InputError(where="board", expected=f"{count} pictures with all corners", found=f"{len(arms)}")
+
+
+def _square_mm(world: World) -> float:
+    """Side of a square, to half a millimetre, of a board that takes up about a third of the right camera's picture."""
+    camera, depth_mm = world.cameras["right"], world.config.scene.target_mm[2]
+    extent_mm = depth_mm * min(camera.width / camera.fx, camera.height / camera.fy)
+    return max(0.5, 0.5 * round(2.0 * _SQUARE_OF_PICTURE * extent_mm))
 
 
 def _pose(picture: Array, camera: Camera, board: Board) -> Array | None:

@@ -17,7 +17,7 @@ from rmis_calib import __version__
 from rmis_calib.errors import InputError, RmisCalibError
 from rmis_calib.io.atomic import atomic_write
 from rmis_calib.studies.registry import Method, NoiseSource, find_method, find_noise_source, load_extensions
-from rmis_calib.studies.settings import Cameras, SetupSettings
+from rmis_calib.studies.settings import Cameras, EquipmentSettings, SetupSettings
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -92,7 +92,7 @@ def make_cells(
 
     Noise is drawn from the same seeds in every condition, so that differences between conditions are not those of luck.
     """
-    common = [__version__, asdict(setup), _content_of(setup), [file_digest(path) for path in extensions]]
+    common = [__version__, asdict(setup), content_of(setup), [file_digest(path) for path in extensions]]
     cells = []
     for condition in conditions:
         block = min(_MOST_TRIALS, max(1, _BLOCK_MOTIONS // condition.motions))
@@ -221,7 +221,7 @@ def _label(condition: "Condition") -> str:
     return f"{condition.noise or 'levels'}-{condition.coefficient:g}_{grid}_{condition.motions}"
 
 
-def _content_of(setup: SetupSettings) -> list[str]:
+def content_of(setup: EquipmentSettings) -> list[str]:
     """Digests of the files that a set-up names: other content, other numbers."""
     named = [Path(item) for item in (setup.robot, setup.stereo) if item is not None]
     return [file_digest(path) for path in named if path.is_file()]

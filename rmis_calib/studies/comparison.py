@@ -11,8 +11,9 @@ from rmis_calib.studies.experiment import BOARD, LINES, make_experiments, run_ex
 from rmis_calib.studies.output import StudyResult, output_names, write_record, write_study
 from rmis_calib.studies.page import Table
 from rmis_calib.studies.plots import Figure, Panel, Series, Style, axis_label, curve
-from rmis_calib.studies.prepare import find_methods
-from rmis_calib.studies.reprojection import MEASURES, triple, truth_px
+from rmis_calib.studies.prepare import find_methods, prepare_pictures
+from rmis_calib.studies.registry import find_noise_source
+from rmis_calib.studies.reprojection import MEASURES, noise_in_words, triple, truth_px
 from rmis_calib.studies.settings import ComparisonStudySettings
 from rmis_calib.studies.summary import Group, summarise
 
@@ -47,7 +48,7 @@ def study_comparison(
         OutputError: a folder that may not be written.
     """
     settings, out = settings or ComparisonStudySettings(), Path(out)
-    find_methods(settings.methods, settings.run.extensions)
+    _, cameras = prepare_pictures(settings, ("stereo", "mono"))
     _check_board_methods(settings)
     quick = settings.run.quick
     counts = settings.motions or (QUICK if quick else FULL)
@@ -56,7 +57,7 @@ def study_comparison(
     with study_folder(out, "comparison", output_names([BY_MOTIONS, BY_EXPERIMENT])) as store:
         about = write_record(out, "comparison", settings, command)
         cells = make_experiments(
-            store, experiments, settings.methods, settings.board_methods, ("stereo",), counts, board_counts, settings
+            store, experiments, settings.methods, settings.board_methods, cameras[:1], counts, board_counts, settings
         )
         table = run_cells(cells, settings.run, progress, run_experiment)
         keys = ("target", "motions", "cameras", "method")
@@ -78,6 +79,10 @@ def _check_board_methods(settings: ComparisonStudySettings) -> None:
             raise InputError(where="--board-methods", expected=f"one of {', '.join(known)}", found=name)
         if name in settings.methods:
             raise InputError(where="--methods", expected="other names than those of --board-methods", found=name)
+    source = None if settings.pictures.source is None else find_noise_source(settings.pictures.source)
+    if source is not None and source.disturb is not None and source.disturb_board is None:
+        expected = "disturb_board beside disturb: the same errors for the board"
+        raise InputError(where=f"noise source {source.name}", expected=expected, found="none")
 
 
 def _names(settings: ComparisonStudySettings) -> list[tuple[str, str, str]]:
@@ -121,12 +126,10 @@ def _without_line(series: Series) -> Series:
 
 
 def _caption(settings: ComparisonStudySettings) -> str:
-    pictures = settings.pictures
     return (
-        f"Rendered pictures; {pictures.kinematics_noise_mm:g} mm and {pictures.kinematics_noise_deg:g} deg of noise in "
-        f"each arm. Medians and quartiles of {settings.n_trials} trials an experiment; reprojection: mean of "
-        f"{pictures.validation} further poses, whose kinematics are as noisy, so that even the true transform has an "
-        "error."
+        f"Rendered pictures; {noise_in_words(settings.pictures)}. Medians and quartiles of {settings.n_trials} trials "
+        f"an experiment; reprojection: mean of {settings.pictures.validation} "
+        "further poses, whose kinematics are as noisy, so that even the true transform has an error."
     )
 
 

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,12 +31,14 @@ class Progress:
     Attributes:
         done, total: cells of this run.
         stored: cells that were there before.
+        share: of the work of this run that is done, 0 to 1, unfinished cells included.
         left_s: seconds left; None before anything is known.
     """
 
     done: int
     total: int
     stored: int
+    share: float
     left_s: float | None
 
 
@@ -80,7 +83,7 @@ def run_cells(cells: Sequence[Any], run: RunSettings, progress: Watcher, work: A
     Args:
         cells: of the study (`Cell`, `Experiment`): a dataclass with `parts` and a `weight`.
         run: workers or cluster.
-        progress: called when a cell ends.
+        progress: called when a cell ends or gets on.
         work: does a cell; returns what went wrong.
 
     Raises:
@@ -89,30 +92,51 @@ def run_cells(cells: Sequence[Any], run: RunSettings, progress: Watcher, work: A
     """
     missing = [replace(cell, parts=tuple(part for part in cell.parts if not part.path.exists())) for cell in cells]
     todo = [cell for cell in missing if cell.parts]
-    weights, begun = [cell.weight for cell in todo], time.monotonic()
-    done_weight = done = 0
-    progress(Progress(0, len(todo), len(cells) - len(todo), None))
-    events = _events(todo, run, work)
+    meter = _Meter([cell.weight for cell in todo], len(cells) - len(todo), progress)
+    meter.tell()
+    events = _events(todo, run, work, meter.advance)
     try:
         for event in events:
             if event.kind == "died":
                 raise RmisCalibError(f"study: {event.value}; the same command goes on where it stopped")
-            if event.kind != "finished":
-                continue
-            if event.value:
-                raise InputError(event.value)
-            done, done_weight = done + 1, done_weight + weights[event.index]
-            left_s = (time.monotonic() - begun) * (sum(weights) - done_weight) / done_weight
-            progress(Progress(done, len(todo), len(cells) - len(todo), left_s))
+            if event.kind == "progress":
+                meter.advance(event.index, *event.value)
+            if event.kind == "finished":
+                if event.value:
+                    raise InputError(event.value)
+                meter.finish(event.index)
     finally:
         events.close()
     return _gathered(cells)
 
 
-def _events(todo: Sequence[Any], run: RunSettings, work: Any) -> Any:
+class _Meter:
+    """How far the cells of a run are, by their weights."""
+
+    def __init__(self, weights: Sequence[int], stored: int, progress: Watcher) -> None:
+        self._weights, self._shares = weights, [0.0] * len(weights)
+        self._stored, self._progress = stored, progress
+        self._done, self._begun = 0, time.monotonic()
+
+    def advance(self, index: int, _: str, done: int, total: int) -> None:
+        """A cell has done so much of its work."""
+        self._shares[index] = max(self._shares[index], min(1.0, done / max(1, total)))
+        self.tell()
+
+    def finish(self, index: int) -> None:
+        self._shares[index], self._done = 1.0, self._done + 1
+        self.tell()
+
+    def tell(self) -> None:
+        share = sum(w * s for w, s in zip(self._weights, self._shares, strict=True)) / (sum(self._weights) or 1.0)
+        left_s = (time.monotonic() - self._begun) * (1.0 - share) / share if share > 0.0 else None
+        self._progress(Progress(self._done, len(self._weights), self._stored, share, left_s))
+
+
+def _events(todo: Sequence[Any], run: RunSettings, work: Any, advance: Callable[..., None]) -> Any:
     workers = min(run.workers or cores(), max(1, len(todo)))
     if not todo or (workers == 1 and run.cluster is None):
-        return _in_this_process(todo, work)
+        return _in_this_process(todo, work, advance)
     free = free_memory_bytes()
     limits = Limits(
         threads=max(1, cores() // workers),
@@ -127,9 +151,9 @@ def _events(todo: Sequence[Any], run: RunSettings, work: Any) -> Any:
     return run_tasks(todo, work, workers, limits)
 
 
-def _in_this_process(todo: Sequence[Any], work: Any) -> Iterator[Event]:
+def _in_this_process(todo: Sequence[Any], work: Any, advance: Callable[..., None]) -> Iterator[Event]:
     for index, cell in enumerate(todo):
-        yield Event(index, "finished", work(cell, lambda *_: None), 1, 0)
+        yield Event(index, "finished", work(cell, partial(advance, index)), 1, 0)
 
 
 def _gathered(cells: Sequence[Any]) -> "pyarrow.Table":

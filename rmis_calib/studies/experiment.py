@@ -12,18 +12,21 @@ import numpy as np
 
 from rmis_calib import __version__
 from rmis_calib.errors import InputError, InsufficientDataError, RmisCalibError
-from rmis_calib.studies.cells import Columns, Part, Report, file_digest, finite_or_infinite, write_table
+from rmis_calib.studies.cells import Columns, Part, Report, content_of, file_digest, finite_or_infinite, write_table
 from rmis_calib.studies.registry import Method, find_method, load_extensions
-from rmis_calib.studies.settings import Cameras, PictureSettings
+from rmis_calib.studies.settings import Cameras, EquipmentSettings, PictureSettings
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from rmis_calib.studies.pictures import Measured
+    from rmis_calib.studies.robot_noise import RobotNoise
 
 LINES, BOARD = "lines", "board"
 _LEFT_BOARD = ("ata",)
-"""Board methods that use the second camera."""
+"""Board methods that use the second camera, where there is one."""
+_OF_TRIALS = ("kinematics_noise_mm", "kinematics_noise_deg", "source", "coefficient")
+"""Settings that the pictures do not depend on."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,8 @@ class Experiment:
     Attributes:
         number: 0 has the scene's own hand-eye transform, others a random one.
         measured: file of what the pictures say.
-        pictures: what is rendered.
+        pictures: what is rendered, and how noisy the robot is.
+        setup: robot, cameras and motion.
         motions, board_motions: numbers to draw from all that are measured.
         extensions: files of own methods.
         trials: draws of motions and noise, for each number and method.
@@ -45,6 +49,7 @@ class Experiment:
     number: int
     measured: Path
     pictures: PictureSettings
+    setup: EquipmentSettings
     motions: tuple[int, ...]
     board_motions: tuple[int, ...]
     extensions: tuple[Path, ...]
@@ -72,11 +77,13 @@ def make_experiments(
     """Set-ups of a study; their files' names tell what their numbers depend on."""
     pictures, run = settings.pictures, settings.run
     preset = Path(pictures.preset)
-    look = [__version__, asdict(pictures), file_digest(preset) if preset.is_file() else ""]
+    rendered = {name: value for name, value in asdict(pictures).items() if name not in _OF_TRIALS}
+    look = [__version__, rendered, file_digest(preset) if preset.is_file() else ""]
+    look += [asdict(settings.setup), content_of(settings.setup)]
     draws = [asdict(pictures), settings.n_trials, run.seed, [file_digest(path) for path in run.extensions]]
     wanted: list[tuple[str, Cameras]] = [(name, view) for view in cameras for name in methods]
     for name in board_methods:
-        wanted.append((name, "stereo" if name in _LEFT_BOARD else "mono"))
+        wanted.append((name, "stereo" if name in _LEFT_BOARD and "stereo" in cameras else "mono"))
     made = []
     for number in range(count):
         mark = _mark([look, max(motions), max(board_motions, default=0), run.seed, number])
@@ -90,6 +97,7 @@ def make_experiments(
                 number=number,
                 measured=folder / f"measured-{number}_{mark}.npz",
                 pictures=pictures,
+                setup=settings.setup,
                 motions=tuple(sorted(motions)),
                 board_motions=tuple(sorted(board_motions)),
                 extensions=run.extensions,
@@ -104,16 +112,18 @@ def make_experiments(
 
 def run_experiment(cell: Experiment, report: Report) -> str:
     """Render and measure, solve and store; the empty string, or what went wrong in a line. Raises nothing."""
-    from rmis_calib.studies.pictures import Measured, measure, world_config
+    from rmis_calib.studies.pictures import Measured, measure, staged
 
     try:
         load_extensions(cell.extensions)
         if not cell.measured.is_file():
             count = max(cell.motions) + cell.pictures.validation
-            config = world_config(cell.pictures, count, cell.seed, cell.number)
-            measure(config, max(cell.board_motions, default=0), report).save(cell.measured)
+            stage = staged(cell.pictures, cell.setup, count, cell.seed, cell.number)
+            boards = max(cell.board_motions, default=0)
+            measure(stage, boards, lambda _, done, total: report("measuring", done, 2 * total)).save(cell.measured)
         measured = Measured.load(cell.measured)
-        for part in cell.parts:
+        for number, part in enumerate(cell.parts):
+            report("solving", len(cell.parts) + number, 2 * len(cell.parts))
             is_board = part.method in cell.board_methods
             write_table(part.path, _board_rows(cell, part, measured) if is_board else _line_rows(cell, part, measured))
     except RmisCalibError as error:
@@ -144,20 +154,24 @@ def _board_rows(cell: Experiment, part: Part, measured: "Measured") -> Columns:
 
     from rmis_calib import baselines
 
-    board = measured.board
+    board, noise = measured.board, _robot_noise(cell)
 
     def solve(motions: int, generator: np.random.Generator) -> "Tensor":
         index = _choose(len(board["base_T_arm"]), motions, cell.trials, generator)
-        base_T_arm = board["base_T_arm"][index] @ _noise(cell.pictures, index.shape, generator)
-        second: dict[str, Any] = {}
+        told: dict[str, Any] = {
+            "base_T_arm": board["base_T_arm"][index] @ noise.arm(index.shape, generator),
+            "camera_right_T_board": board["camera_right_T_board"][index],
+        }
         if part.cameras == "stereo":
-            second = {
-                "camera_left_T_board": board["camera_left_T_board"][index],
-                "camera_left_T_camera": board["camera_left_T_camera_right"],
-            }
+            told["camera_left_T_board"] = board["camera_left_T_board"][index]
+            extrinsics = noise.extrinsics(board["camera_left_T_camera_right"], cell.trials, generator)
+            told["camera_left_T_camera_right"] = extrinsics
+        noise.disturb_board(told, generator)
         found = baselines.hand_eye(
-            base_T_arm, board["camera_right_T_board"][index], part.method, covariance=False, **second
-        )
+            told["base_T_arm"], told["camera_right_T_board"], part.method, covariance=False,
+            camera_left_T_board=told.get("camera_left_T_board"),
+            camera_left_T_camera=told.get("camera_left_T_camera_right"),
+        )  # fmt: skip
         flange_T_camera = found.flange_T_camera  # the flange is `arm` here
         usable = torch.isfinite(flange_T_camera).flatten(-2).all(-1)
         safe = torch.where(usable[..., None, None], flange_T_camera, torch.eye(4, dtype=flange_T_camera.dtype))
@@ -220,17 +234,21 @@ def drawn_lines(measured: "Measured", motions: int, cell: Experiment, generator:
     lines = measured.lines
     n = len(lines["arm_T_rcm"]) - cell.pictures.validation
     index = _choose(n, motions, cell.trials, generator)
-    constant = {"camera_left_T_camera_right"}
+    extrinsics = lines.get("camera_left_T_camera_right")
     arrays: dict[str, Any] = {}
     for key in OBSERVATION_KEYS:
         value = lines.get(key)
-        if value is None or key.startswith(("laparoscope_base_T_", "unknown_")):  # set-up and offsets are exact
+        if value is None or key == "camera_left_T_camera_right":
             continue
-        is_constant = key in constant or np.ndim(value) == 0
-        arrays[key] = (
-            value[index] if not is_constant else np.broadcast_to(value, (cell.trials, *np.shape(value))).copy()
-        )
-    arrays["arm_T_rcm"] = _logged(lines["arm_T_rcm"][index], cell.pictures, generator)
+        if key.startswith(("laparoscope_base_T_", "unknown_")):  # set-up and offsets are exact
+            continue
+        is_constant = np.ndim(value) == 0
+        arrays[key] = np.broadcast_to(value, cell.trials).copy() if is_constant else value[index]
+    noise = _robot_noise(cell)
+    arrays["arm_T_rcm"] = noise.logged(lines["arm_T_rcm"][index], generator)
+    if extrinsics is not None:
+        arrays["camera_left_T_camera_right"] = noise.extrinsics(extrinsics, cell.trials, generator)
+    noise.disturb(arrays, generator)
     return arrays
 
 
@@ -240,7 +258,7 @@ def head_errors_px(measured: "Measured", camera_right_T_arm: np.ndarray, cell: E
     generator = np.random.default_rng([cell.seed, cell.number, 0])
     lines, last = measured.lines, slice(-cell.pictures.validation, None)
     arm_T_rcm = np.broadcast_to(lines["arm_T_rcm"][last], (len(camera_right_T_arm), cell.pictures.validation, 4, 4))
-    camera_right_T_rcm = camera_right_T_arm[:, None] @ _logged(arm_T_rcm, cell.pictures, generator)
+    camera_right_T_rcm = camera_right_T_arm[:, None] @ _robot_noise(cell).logged(arm_T_rcm, generator)
     p = (
         np.einsum("tnij,nj->tni", camera_right_T_rcm[..., :3, :3], lines["rcm_p_head"][last])
         + camera_right_T_rcm[..., :3, 3]
@@ -253,18 +271,10 @@ def head_errors_px(measured: "Measured", camera_right_T_arm: np.ndarray, cell: E
     return distance.mean(-1)
 
 
-def _logged(arm_T_rcm: np.ndarray, pictures: PictureSettings, generator: np.random.Generator) -> np.ndarray:
-    """What a robot whose two arms are both noisy says of true poses (..., 4, 4)."""
-    shape = arm_T_rcm.shape[:-2]
-    noisy_arm = np.linalg.inv(_noise(pictures, shape, generator))
-    return noisy_arm @ arm_T_rcm @ _noise(pictures, shape, generator)
+def _robot_noise(cell: Experiment) -> "RobotNoise":
+    from rmis_calib.studies.robot_noise import RobotNoise
 
-
-def _noise(pictures: PictureSettings, shape: tuple[int, ...], generator: np.random.Generator) -> np.ndarray:
-    from data_synth.kinematics import pose_noise
-
-    sigma_rad = float(np.deg2rad(pictures.kinematics_noise_deg))
-    return pose_noise(generator, shape, sigma_rad, pictures.kinematics_noise_mm)
+    return RobotNoise.of(cell.pictures)
 
 
 def _choose(n: int, count: int, trials: int, generator: np.random.Generator) -> np.ndarray:

@@ -52,7 +52,7 @@ def study_plan(
         OutputError: a folder that may not be written.
     """
     settings, out = settings or PlanSettings(), Path(out)
-    ready = prepare(settings, [])
+    ready = prepare(settings, [] if settings.source is None else [settings.source])
     with study_folder(out, "plan", output_names([FIGURE])) as store:
         about = write_record(out, "plan", settings, command)
 
@@ -84,7 +84,8 @@ def study_plan(
 def _condition(settings: PlanSettings, motions: int) -> Condition:
     levels = tuple((name, float(getattr(settings, name))) for name in _LEVELS)
     moving = 2 if settings.laparoscope == "moves" else 1
-    return Condition("", 0.0, moving, 0, motions, motion="random", levels=levels)
+    coefficient = 0.0 if settings.source is None else settings.coefficient
+    return Condition(settings.source or "", coefficient, moving, 0, motions, motion="random", levels=levels)
 
 
 def _ladder(most: int) -> list[int]:

@@ -52,12 +52,15 @@ class NoiseSource:
         levels: from a coefficient to noise levels of `data_synth.LineStudyConfig` (`kinematics_noise_mm`, ...).
         disturb: changes the simulated arrays of an observations file, (trials, N, ...), in place; the Cramer-Rao bound
             does not know of it.
+        disturb_board: the same for a board: `base_T_arm` (trials, N, 4, 4), `camera_right_T_board`, and with two
+            cameras `camera_left_T_board` and `camera_left_T_camera_right` (trials, 4, 4).
     """
 
     name: str
     title: str
     levels: Levels
     disturb: "Disturb | None" = None
+    disturb_board: "Disturb | None" = None
 
 
 METHODS: dict[str, Method] = {}
@@ -83,15 +86,24 @@ def method(
     return register
 
 
-def noise_source(name: str, title: str | None = None, disturb: "Disturb | None" = None) -> Callable[[_Levels], _Levels]:
+def noise_source(
+    name: str,
+    title: str | None = None,
+    disturb: "Disturb | None" = None,
+    disturb_board: "Disturb | None" = None,
+) -> Callable[[_Levels], _Levels]:
     """Register a noise source: `@noise_source("mine") def levels(coefficient): return {"kinematics_noise_mm": ...}`.
+
+    Args:
+        name, title, disturb, disturb_board: as in `NoiseSource`; `disturb_board` is needed by `study_comparison` where
+            there is `disturb`.
 
     Raises:
         InputError: the name is taken.
     """
 
     def register(levels: _Levels) -> _Levels:
-        _add(NOISE_SOURCES, NoiseSource(name, title or name, levels, disturb), "noise source")
+        _add(NOISE_SOURCES, NoiseSource(name, title or name, levels, disturb, disturb_board), "noise source")
         return levels
 
     return register

@@ -11,9 +11,9 @@ from rmis_calib.studies.experiment import make_experiments, run_experiment
 from rmis_calib.studies.output import StudyResult, output_names, write_record, write_study
 from rmis_calib.studies.page import Table
 from rmis_calib.studies.plots import Figure, Panel, axis_label, method_curves
-from rmis_calib.studies.prepare import find_methods
-from rmis_calib.studies.registry import Method
-from rmis_calib.studies.settings import ReprojectionStudySettings
+from rmis_calib.studies.prepare import prepare_pictures
+from rmis_calib.studies.registry import Method, find_noise_source
+from rmis_calib.studies.settings import Cameras, PictureSettings, ReprojectionStudySettings
 from rmis_calib.studies.summary import Group, summarise
 
 if TYPE_CHECKING:
@@ -51,54 +51,61 @@ def study_reprojection(
         OutputError: a folder that may not be written.
     """
     settings, out = settings or ReprojectionStudySettings(), Path(out)
-    methods = find_methods(settings.methods, settings.run.extensions)
+    methods, cameras = prepare_pictures(settings, settings.cameras)
     counts = settings.motions or (QUICK if settings.run.quick else FULL)
     with study_folder(out, "reprojection", output_names([FIGURE])) as store:
         about = write_record(out, "reprojection", settings, command)
-        cells = make_experiments(store, 1, settings.methods, (), settings.cameras, counts, (), settings)
+        cells = make_experiments(store, 1, settings.methods, (), cameras, counts, (), settings)
         table = run_cells(cells, settings.run, progress, run_experiment)
         groups = summarise(table, KEYS)
         result = StudyResult(
             "reprojection", table, tuple(group.row() for group in groups), (),
-            (_figure(groups, methods, settings, truth_px(table)),), _tables(groups, methods, settings), out,
+            (_figure(groups, methods, cameras, settings, truth_px(table)),), _tables(groups, methods, cameras), out,
         )  # fmt: skip
         write_study(result, TITLE, about)
     return result
 
 
 def _figure(
-    groups: Sequence[Group], methods: Sequence[Method], settings: ReprojectionStudySettings, floor_px: float
+    groups: Sequence[Group],
+    methods: Sequence[Method],
+    cameras: Sequence[Cameras],
+    settings: ReprojectionStudySettings,
+    floor_px: float,
 ) -> Figure:
     rows = []
     for measure in MEASURES:
         row = []
-        for view in dict.fromkeys(settings.cameras):
+        for view in cameras:
             own = [group for group in groups if group.keys["cameras"] == view]
             curves = method_curves(own, measure, "motions", methods)
             level = (floor_px, "the true transform") if measure == "reprojection" else None
             row.append(Panel(view, "motions", axis_label(measure), True, curves, level))
         rows.append(tuple(row))
-    noise = settings.pictures
     caption = (
-        f"Rendered pictures through the whole pipeline; {noise.kinematics_noise_mm:g} mm and "
-        f"{noise.kinematics_noise_deg:g} deg of noise in each arm. Medians and quartiles of {settings.n_trials} "
-        f"trials; reprojection: mean of {noise.validation} further poses, whose kinematics are as noisy, so that even "
-        "the true transform has an error."
+        f"Rendered pictures through the whole pipeline; {noise_in_words(settings.pictures)}. Medians and quartiles of "
+        f"{settings.n_trials} trials; reprojection: mean of {settings.pictures.validation} "
+        "further poses, whose kinematics are as noisy, so that even the true transform has an error."
     )
     return Figure(FIGURE, TITLE, caption, tuple(rows))
 
 
-def _tables(
-    groups: Sequence[Group], methods: Sequence[Method], settings: ReprojectionStudySettings
-) -> tuple[Table, ...]:
+def _tables(groups: Sequence[Group], methods: Sequence[Method], cameras: Sequence[Cameras]) -> tuple[Table, ...]:
     counts = sorted({group.keys["motions"] for group in groups})
     rows = []
-    for view in dict.fromkeys(settings.cameras):
+    for view in cameras:
         for method in methods:
             of = {g.keys["motions"]: g for g in groups if (g.keys["cameras"], g.keys["method"]) == (view, method.name)}
             rows.append((view, method.title, *(triple(of[n]) for n in counts)))
     headings = ("cameras", "method", *(f"{n:,}" for n in counts))
     return (Table("Median head-point error, px / deg / mm", headings, tuple(rows)),)
+
+
+def noise_in_words(pictures: PictureSettings) -> str:
+    """For captions."""
+    if pictures.source is not None:
+        return f"noise {find_noise_source(pictures.source).title}, coefficient {pictures.coefficient:g}"
+    return f"{pictures.kinematics_noise_mm:g} mm and {pictures.kinematics_noise_deg:g} deg of noise in each arm"
 
 
 def triple(group: Group) -> str:

@@ -19,15 +19,15 @@ FULL_TRIALS = 100
 
 
 @dataclass(frozen=True, config=_STRICT)
-class SetupSettings:
-    """The robot, the cameras and the place of the instrument that are simulated. Defaults: those of the built-in
-    scene."""
+class EquipmentSettings:
+    """The robot, the cameras, how far the arms move, and where the instrument is. Defaults: the built-in scene."""
 
     robot: str | None = None
-    """Your robot: a preset's name or robot.yaml. Its arms are placed so that the instrument is where the scene wants
-    it. Default: two arms of three joints."""
+    """Your robot: a preset's name or robot.yaml. The study places its arms so that the instrument is where
+    --instrument-rcm-mm and --target-mm say. Default: two arms of three joints."""
     stereo: Path | None = None
-    """Your cameras: stereo.yaml. Focal length, picture size and extrinsics count; lines are taken as undistorted."""
+    """Your cameras: stereo.yaml or another calibration file. Rendered pictures have their distortion; without pictures,
+    focal length, picture size and extrinsics count."""
     laparoscope_arm: str = "laparoscope"
     """Name of the laparoscope's arm in the robot."""
     instrument_arm: str = "instrument"
@@ -45,6 +45,12 @@ class SetupSettings:
     errors count."""
     shaft_diameter_mm: Positive | None = None
     """Diameter of the instrument's shaft."""
+
+
+@dataclass(frozen=True, config=_STRICT)
+class SetupSettings(EquipmentSettings):
+    """What is simulated without pictures."""
+
     pixel_noise_px: NotNegative = 0.5
     """Noise of every image point, 1 sigma per coordinate."""
 
@@ -142,6 +148,10 @@ class PlanSettings:
     """Error of the stereo extrinsics, 1 sigma per axis."""
     stereo_noise_deg: NotNegative = 0.05
     """Rotational part of the same."""
+    source: str | None = None
+    """A noise source, whose levels take the place of those above, and which may add errors of its own."""
+    coefficient: NotNegative = 1.0
+    """Its noise coefficient."""
     setup: SetupSettings = SetupSettings()
     """What is simulated."""
     run: RunSettings = RunSettings()
@@ -159,14 +169,15 @@ class PictureSettings:
 
     preset: str = "demo"
     """Appearance: a preset of configs/synth or a YAML file."""
-    rotation_range_deg: Positive = 10.0
-    """Full range of every revolute joint."""
-    translation_range_mm: Positive = 20.0
-    """Full range of every insertion."""
     kinematics_noise_mm: NotNegative = 0.3
     """Noise of each arm's end pose, 1 sigma per axis, drawn anew for every motion and trial."""
     kinematics_noise_deg: NotNegative = 0.1
     """Rotational part of the same."""
+    source: str | None = None
+    """A noise source for kinematics and stereo extrinsics, in place of the noise above. Noise of the cameras' poses or
+    of points has no place here: the pictures have their own."""
+    coefficient: NotNegative = 1.0
+    """Its noise coefficient."""
     validation: Count = 15
     """Further poses of the instrument, whose head point is compared with where the calibration puts it."""
 
@@ -182,7 +193,9 @@ class ReprojectionStudySettings:
     cameras: tuple[Cameras, ...] = ("mono", "stereo")
     """Cameras used."""
     pictures: PictureSettings = PictureSettings()
-    """What is rendered."""
+    """What is rendered, and how noisy the robot is."""
+    setup: EquipmentSettings = EquipmentSettings()
+    """Robot, cameras and motion."""
     run: RunSettings = RunSettings()
     """How it is run."""
 
@@ -207,7 +220,9 @@ class ComparisonStudySettings:
     board_motions: tuple[Annotated[int, Field(ge=4)], ...] | None = None
     """Numbers of motions of the board. Default: 4, 6, 8, 12, 16, 24, 32; with --quick 6, 12 and 16."""
     pictures: PictureSettings = PictureSettings()
-    """What is rendered."""
+    """What is rendered, and how noisy the robot is."""
+    setup: EquipmentSettings = EquipmentSettings()
+    """Robot, cameras and motion."""
     run: RunSettings = RunSettings()
     """How it is run."""
 

@@ -1,23 +1,19 @@
 """Trials of a study: simulated by `data_synth`, which shares no code with the solver that they are for."""
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from data_synth import LineStudyConfig, SceneSettings, simulate_lines
-from data_synth.kinematics import Arm, Joint
-from data_synth.own_robot import MOVING_JOINTS, scene_with_arms
-from data_synth.scene import Scene, build_scene
-from rmis_calib.errors import InputError, RobotError
-from rmis_calib.geometry.rotations import matrix_to_rotvec
-from rmis_calib.io.robot import load_robot
-from rmis_calib.io.stereo import read_stereo
-from rmis_calib.robot import Arm as RobotArm
+from data_synth.scene import Scene
+from rmis_calib.errors import InputError
+from rmis_calib.io.intrinsics import Intrinsics
 from rmis_calib.solver import Problem
 from rmis_calib.studies.builtin import SETTINGS
+from rmis_calib.studies.equipment import make_scene, read_cameras
 from rmis_calib.studies.measures import Bound, bound_in_measures, cramer_rao_bound
 from rmis_calib.studies.registry import NoiseSource
 from rmis_calib.studies.settings import SetupSettings
@@ -103,23 +99,20 @@ def make_setup(settings: SetupSettings) -> Setup:
 
     Raises:
         FileError, RobotError, RecordingError: robot or stereo file that cannot be read.
-        InputError: a robot that cannot take up the scene.
+        InputError: a robot that cannot take up the scene, or a working point out of the picture.
     """
-    names = ("laparoscope_rcm_behind_mm", "instrument_rcm_mm", "target_mm", "shaft_diameter_mm")
-    changes: dict[str, Any] = {name: getattr(settings, name) for name in names if getattr(settings, name) is not None}
     config = LineStudyConfig(
         rotation_range_deg=settings.rotation_range_deg,
         translation_range_mm=settings.translation_range_mm,
         pixel_noise_px=settings.pixel_noise_px,
     )
-    cameras = 2
-    if settings.stereo is not None:
-        config, extrinsics = _with_cameras(config, settings)
-        changes |= extrinsics
-        cameras = 2 if extrinsics else 1
-    config = replace(config, scene=replace(SceneSettings(), **changes))
-    scene = build_scene(config.scene) if settings.robot is None else _with_robot(settings, config.scene)
-    return Setup(scene, config, cameras)
+    cameras = read_cameras(settings)
+    if cameras is not None:
+        config = _with_picture(config, cameras.right)
+    scene_settings, scene = make_scene(settings, config.scene, cameras)
+    _check_in_view(config, scene_settings)
+    is_pair = cameras is None or cameras.camera_left_T_camera_right is not None
+    return Setup(scene, replace(config, scene=scene_settings), 2 if is_pair else 1)
 
 
 def simulate(setup: Setup, condition: Condition, source: NoiseSource | None, trials: int, seed: int) -> Trials:
@@ -151,77 +144,20 @@ def simulate(setup: Setup, condition: Condition, source: NoiseSource | None, tri
     )
 
 
-def _with_cameras(config: LineStudyConfig, settings: SetupSettings) -> tuple[LineStudyConfig, dict[str, Any]]:
-    """Focal length and picture of the right camera; extrinsics as scene settings, none for a single camera."""
-    assert settings.stereo is not None
-    stereo = read_stereo(settings.stereo)
-    right, (height, width) = stereo.right, stereo.right.image_size
-    config = replace(
+def _check_in_view(config: LineStudyConfig, scene: SceneSettings) -> None:
+    """Refuse a working point that the picture does not show."""
+    x, y, z = scene.target_mm
+    half = config.half_width_px / config.focal_px, config.half_height_px / config.focal_px
+    if z <= 0.0 or abs(x) > half[0] * z or abs(y) > half[1] * z:
+        raise InputError(where="--target-mm", expected="a point in the right camera's picture", found=scene.target_mm)
+
+
+def _with_picture(config: LineStudyConfig, right: Intrinsics) -> LineStudyConfig:
+    """Focal length and picture of the right camera, without its distortion."""
+    height, width = right.image_size
+    return replace(
         config,
         focal_px=float(np.sqrt(right.fx * right.fy)),
         half_width_px=min(right.cx + 0.5, width - 0.5 - right.cx),
         half_height_px=min(right.cy + 0.5, height - 0.5 - right.cy),
     )
-    matrix = stereo.camera_left_T_camera_right
-    if matrix is None:
-        return config, {}
-    rotvec_deg = torch.rad2deg(matrix_to_rotvec(torch.as_tensor(matrix[:3, :3])))
-    return config, {
-        "stereo_rotvec_deg": tuple(rotvec_deg.tolist()),
-        "stereo_translation_mm": tuple(matrix[:3, 3].tolist()),
-    }
-
-
-def _with_robot(settings: SetupSettings, scene: SceneSettings) -> Scene:
-    assert settings.robot is not None
-    robot = load_robot(settings.robot)
-    for name, value in (("laparoscope-arm", settings.laparoscope_arm), ("instrument-arm", settings.instrument_arm)):
-        if value not in robot.arms:
-            raise RobotError(where=f"--{name}", expected=f"one of {', '.join(robot.arms)}", found=value)
-    laparoscope, instrument = robot.arms[settings.laparoscope_arm], robot.arms[settings.instrument_arm]
-    if not instrument.is_instrument:
-        expected = "an arm with rcm_frame, shaft_frame and head_point"
-        raise RobotError(where="--instrument-arm", expected=expected, found=settings.instrument_arm)
-    arms = (_synthetic(laparoscope, robot.dh_convention), _synthetic(instrument, robot.dh_convention))
-    try:
-        placed = scene_with_arms(scene, *arms)
-    except ValueError as error:
-        raise RobotError(f"{error}", where=f"robot {robot.name}") from error
-    _check_limits(laparoscope, placed.laparoscope_home, settings, settings.laparoscope_arm)
-    _check_limits(instrument, placed.instrument_home, settings, settings.instrument_arm)
-    return placed
-
-
-def _synthetic(arm: RobotArm, convention: Any) -> Arm:
-    """The arm in the generator's own kinematics; where its base stands is left to the scene."""
-    joints = tuple(
-        Joint(j.name, j.type, j.alpha_rad, j.a_mm, j.theta_rad, j.d_mm, j.offset) for j in arm.joints
-    )  # fmt: skip
-    head = arm.head_point
-    return Arm(
-        base_T_arm_base=np.eye(4),
-        joints=joints,
-        convention=convention,
-        end_T_tool=arm.end_T_tool,
-        rcm_frame=arm.rcm_frame or 0,
-        shaft_frame=len(joints) if arm.shaft_frame is None else arm.shaft_frame,
-        head_frame=len(joints) if head is None else head.frame,
-        head_xyz_mm=(0.0, 0.0, 0.0) if head is None else head.xyz_mm,
-    )
-
-
-def _check_limits(arm: RobotArm, home: np.ndarray, settings: SetupSettings, name: str) -> None:
-    """Refuse motions beyond the joints' limits."""
-    for joint, at in zip(arm.joints[:MOVING_JOINTS], home, strict=False):
-        revolute = joint.type == "revolute"
-        half = 0.5 * (np.deg2rad(settings.rotation_range_deg) if revolute else settings.translation_range_mm)
-        least = -np.inf if joint.min is None else joint.min
-        most = np.inf if joint.max is None else joint.max
-        if at - half < least or at + half > most:
-            unit, scale = ("deg", 180.0 / np.pi) if revolute else ("mm", 1.0)
-            raise InputError(
-                where=f"{name}.{joint.name}",
-                expected=f"readings within its limits, {scale * least:.1f} to {scale * most:.1f} {unit}",
-                found=f"{scale * (at - half):.1f} to {scale * (at + half):.1f} {unit}; change the ranges, or where the "
-                "scene is (--laparoscope-rcm-behind-mm, --instrument-rcm-mm, --target-mm)",
-            )

@@ -30,3 +30,15 @@ def root_of_n(problem):
     estimate = torch.tensor(exact).repeat(problem.n_trials, 1, 1)
     estimate[:, 2, 3] += 10.0 / problem.n_motions**0.5
     return estimate
+
+
+def _bend(name):
+    def disturb(data, coefficient, generator):
+        data[name][..., 1, 3] += coefficient
+
+    return disturb
+
+
+@rc.studies.noise_source("stiff", disturb=_bend("arm_T_rcm"), disturb_board=_bend("base_T_arm"))
+def stiff(coefficient):
+    return {"kinematics_noise_mm": 0.2 * coefficient, "kinematics_noise_deg": 0.0, "stereo_noise_mm": 0.1 * coefficient}

@@ -20,6 +20,7 @@ from rmis_calib.studies.experiment import Experiment, drawn_lines, head_errors_p
 from rmis_calib.studies.pictures import Measured
 from rmis_calib.studies.settings import (
     ComparisonStudySettings,
+    EquipmentSettings,
     PictureSettings,
     ReprojectionStudySettings,
     RunSettings,
@@ -30,7 +31,7 @@ SMALL = PictureSettings(validation=3)
 
 
 def experiment(pictures: PictureSettings, trials: int = 3) -> Experiment:
-    return Experiment(0, Path("none"), pictures, (4,), (), (), trials, 7, (), ())
+    return Experiment(0, Path("none"), pictures, EquipmentSettings(), (4,), (), (), trials, 7, (), ())
 
 
 def measured(n: int = 10) -> Measured:
