@@ -10,13 +10,11 @@ import yaml
 from rmis_calib.convert.bases import with_logged_bases
 from rmis_calib.convert.joints import Readings, choose_robot, motion_of, readings_of, robot_arms
 from rmis_calib.convert.material import NEEDS_STEREO, NS, ArmLog, Job, Material
-from rmis_calib.convert.settings import ConvertSettings
+from rmis_calib.convert.settings import STILL, ConvertSettings
 from rmis_calib.errors import RecordingError
 from rmis_calib.io.joints import JointLog
 from rmis_calib.io.robot import load_robot, robot_to_dict
 from rmis_calib.robot import Robot
-
-_STILL = ("none", "None", "null")
 
 
 def assemble(material: Material, job: Job, settings: ConvertSettings) -> None:
@@ -92,7 +90,7 @@ def _instrument(arms: dict[str, ArmLog], settings: ConvertSettings, job: Job) ->
 
 
 def _laparoscope(arms: dict[str, ArmLog], instrument: ArmLog, settings: ConvertSettings, job: Job) -> ArmLog | None:
-    if settings.laparoscope in _STILL:
+    if settings.laparoscope in STILL:
         job.note("laparoscope: told to stand still; the frame `arm` is the instrument's base")
         return None
     if settings.laparoscope is not None:

@@ -12,7 +12,7 @@ from rmis_calib.convert.joints import NEEDS_ROBOT, NO_POSES
 from rmis_calib.convert.material import NEEDS_STEREO, ArmLog, Job, Logs, Material
 from rmis_calib.convert.messages import camera_info_of, stamp_ns
 from rmis_calib.convert.salvage import can_salvage, salvaged
-from rmis_calib.convert.settings import ConvertSettings
+from rmis_calib.convert.settings import STILL, ConvertSettings
 from rmis_calib.convert.topic_logs import TopicLogs
 from rmis_calib.convert.topics import Choice, Topic, choose_topics, describe
 from rmis_calib.errors import FileError, RecordingError
@@ -150,6 +150,10 @@ def _check_before_reading(choice: Choice, settings: ConvertSettings, where: str)
         )
     if settings.robot is None and not set(choice.joints) & set(choice.poses):
         raise RecordingError(where=where, expected=NEEDS_ROBOT, found=NO_POSES)
+    arms = [*choice.joints, *(arm for arm in choice.poses if arm not in choice.joints)]
+    for name in (settings.instrument, settings.laparoscope):
+        if name not in (None, *STILL, *arms):
+            raise RecordingError(where=where, expected=f"a log of {name}", found=", ".join(arms))
 
 
 def read_logs(path: Path, settings: ConvertSettings, note: Note) -> tuple[Logs, dict[str, CameraInfo]]:

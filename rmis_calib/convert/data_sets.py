@@ -16,6 +16,7 @@ from rmis_calib.io.readers import open_reader
 from rmis_calib.io.stereo import read_stereo
 
 _SURGPOSE_HZ = 30.0
+_SURGPOSE_JOINTS = 6
 _SURGPOSE_CAMERAS = "StereoCalibrationDVRK.ini"
 
 
@@ -27,17 +28,10 @@ def convert_surgpose(job: Job, settings: ConvertSettings) -> Material:
     """
     folder = job.source
     videos = {side: _first(folder, (f"regular/{side}_video.mp4", f"{side}_video.mp4")) for side in ("right", "left")}
-    with (folder / "api_jp_data.yaml").open(encoding="utf-8") as file:
-        frames = yaml.load(file, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     count = open_reader(videos["right"]).count
     interval_ns = NS / (settings.rate_hz or _SURGPOSE_HZ)
     frame_ns = np.round(np.arange(count) * interval_ns).astype(np.int64) + NS
-    arms: dict[str, ArmLog] = {}
-    for index in sorted(frames, key=int):
-        for name, joints in frames[index].items():
-            log = arms.setdefault(name, ArmLog(name))
-            log.joints.append(np.array(joints, dtype=np.float64))
-            log.joint_ns.append(round(int(index) * interval_ns) + NS)
+    arms = _surgpose_joints(folder / "api_jp_data.yaml", interval_ns)
     job.note(
         f"SurgPose: {count} frames at {1e9 / interval_ns:g} Hz, joints by frame number (a clock offset is looked for)"
     )
@@ -53,6 +47,25 @@ def convert_surgpose(job: Job, settings: ConvertSettings) -> Material:
     return Material(
         Logs(arms), cameras, frame_ns, f"right{suffixes['right']}", f"left{suffixes['left']}", robot="dvrk-classic"
     )
+
+
+def _surgpose_joints(path: Path, interval_ns: float) -> dict[str, ArmLog]:
+    """Joints of every arm, by frame: {"0": {"PSM1": [6 numbers]}, ...}."""
+    arms: dict[str, ArmLog] = {}
+    try:
+        with path.open(encoding="utf-8") as file:
+            frames = yaml.load(file, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        for index in sorted(frames, key=int):
+            for name, joints in frames[index].items():
+                log = arms.setdefault(str(name), ArmLog(str(name)))
+                log.joints.append(np.array(joints, dtype=np.float64).reshape(_SURGPOSE_JOINTS))
+                log.joint_ns.append(round(int(index) * interval_ns) + NS)
+    except (yaml.YAMLError, ValueError, TypeError, AttributeError, LookupError) as problem:
+        expected = f"a mapping of frame numbers to arms with {_SURGPOSE_JOINTS} joints each"
+        raise RecordingError(
+            where=str(path), expected=expected, found=" ".join(str(problem).split())[:120]
+        ) from problem
+    return arms
 
 
 def convert_surgsync(job: Job, settings: ConvertSettings) -> Material:

@@ -104,6 +104,10 @@ def _increasing(ns: np.ndarray, values: np.ndarray, name: str, note: Note) -> Re
     finite = np.isfinite(values).all(axis=1)
     if not (keep & finite).all():
         note(f"{name}: {int((~(keep & finite)).sum())} samples with a repeated stamp or no number were left out")
+    if not (keep & finite).any():
+        raise RecordingError(
+            where=name, expected="joints or poses that are numbers", found=f"none in {len(ns)} samples"
+        )
     return Readings(ns[keep & finite], values[keep & finite])
 
 

@@ -17,6 +17,9 @@ _CHANNELS = {"rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, "8UC4": 4,
 _BAYER = {"bayer_rggb8": "BG", "bayer_bggr8": "RG", "bayer_gbrg8": "GR", "bayer_grbg8": "GB"}
 _YUV = {"yuv422": "UYVY", "uyvy": "UYVY", "yuv422_yuy2": "YUY2", "yuyv": "YUY2"}
 _MAGIC = {b"\xff\xd8\xff": ".jpg", b"\x89PNG": ".png"}
+_LAST_WORDS = {b"\xff\xd8\xff": b"\xff\xd9", b"\x89PNG": b"IEND"}
+_TAIL_BYTES = 1024
+"""How far from its end a JPEG or PNG may say that it ends: cameras pad them."""
 ENCODINGS = (*_CHANNELS, *_BAYER, *_YUV, "mono16", "16UC1")
 
 
@@ -51,6 +54,14 @@ def camera_info_of(message: Any, topic: str) -> CameraInfo:
     model = str(message.distortion_model) or "plumb_bob"
     size = (int(message.height), int(message.width))
     return CameraInfo.from_values(topic, size, model, list(map(float, entry("D"))), entry("K"), entry("R"), entry("P"))
+
+
+def is_cut_off(message: Any) -> bool:
+    """Whether a CompressedImage breaks off: it begins as a JPEG or PNG and never ends."""
+    if not hasattr(message, "format"):
+        return False
+    head, tail = bytes(message.data[:4]), bytes(message.data[-_TAIL_BYTES:])
+    return any(head.startswith(magic) and end not in tail for magic, end in _LAST_WORDS.items())
 
 
 def write_picture(message: Any, stem: Path, topic: str) -> tuple[Path, tuple[int, int] | None]:

@@ -1,15 +1,28 @@
 """One source to one recording folder: whole, or not at all."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from rmis_calib.convert.material import Job, ProgressCallback
 from rmis_calib.convert.settings import ConvertSettings
 from rmis_calib.convert.sources import read_source
-from rmis_calib.errors import FileError
+from rmis_calib.errors import FileError, InputError
 from rmis_calib.io.atomic import atomic_directory
 from rmis_calib.io.outputs import check_apart, check_folder
 from rmis_calib.io.robot import load_robot
+
+
+@contextmanager
+def _places_in_words(folder: Path, source: Path) -> Iterator[None]:
+    """Name no file of a recording that is gone by the time the message is read."""
+    try:
+        yield
+    except (InputError, FileError) as problem:
+        if str(folder) not in str(problem):
+            raise
+        said = str(problem).replace(f"{folder}/", "").replace(str(folder), "it")
+        raise type(problem)(said, where=f"{source}, as a recording") from problem
 
 
 def convert(
@@ -59,7 +72,7 @@ def convert(
     from rmis_calib.convert.assemble import add_notes, assemble
     from rmis_calib.io.description import read_description
 
-    with atomic_directory(out, overwrite=overwrite) as folder:
+    with atomic_directory(out, overwrite=overwrite) as folder, _places_in_words(folder, source):
         job = Job(source, folder, note, progress or (lambda stage, done, total: None))
         material, settings = read_source(job, settings)
         assemble(material, job, settings)

@@ -29,6 +29,9 @@ _LISTS = {"timestamps_ns": 1, "timestamps_ms": 1_000_000, "timestamps": None}
 _EARLIEST_NS = 100_000_000 * NS
 """1973: an earlier stamp is not since 1970, but a frame that carries none."""
 _PAIR_SLACK = 0.5
+_SPANS_APART, _SPANS_DIFFER = 3.0, 0.2
+"""Factor between a video's length and that of its stamps beyond which they do not belong together, and share of it from
+which that is told. Files of 25 or 60 frames a second may hold a stream of 30."""
 
 
 def convert_session(job: Job, settings: ConvertSettings, video: Path | None = None) -> Material:
@@ -98,10 +101,12 @@ def _frame_stamps(video: Path, sidecar: dict[str, Any], note: Note) -> np.ndarra
     """
     ns, what = _stamps_of(sidecar, video)
     latency_ms = float(sidecar.get("estimated_latency_ms") or 0.0)
-    count = open_reader(video, len(ns)).count
+    reader = open_reader(video, len(ns))
+    count = reader.count
     if count != len(ns):
         expected = f"a time stamp for each of the {count} frames"
         raise RecordingError(where=str(video.with_suffix(".json")), expected=expected, found=f"{len(ns)} stamps")
+    _check_spans(video, ns, reader.times_s, note)
     note(
         f"{video.name}: frame times are {what}"
         + (f", less the latency of {latency_ms:g} ms that it states" if latency_ms else "")
@@ -109,14 +114,27 @@ def _frame_stamps(video: Path, sidecar: dict[str, Any], note: Note) -> np.ndarra
     return ns - round(latency_ms * 1e6)
 
 
+def _check_spans(video: Path, ns: np.ndarray, own_s: np.ndarray | None, note: Note) -> None:
+    """Refuse stamps over a time that the video by its own clock can hardly have taken: they are another video's."""
+    if own_s is None or len(ns) < 2 or own_s[-1] <= own_s[0]:
+        return
+    stamped_s, own_span_s = (ns[-1] - ns[0]) / NS, float(own_s[-1] - own_s[0])
+    if not own_span_s / _SPANS_APART < stamped_s < own_span_s * _SPANS_APART:
+        expected = f"time stamps of {video.name}, which runs for {own_span_s:.3g} s"
+        found = f"stamps over {stamped_s:.3g} s: the sidecar of another video?"
+        raise RecordingError(where=str(video.with_suffix(".json")), expected=expected, found=found)
+    if abs(stamped_s - own_span_s) > _SPANS_DIFFER * own_span_s:
+        spans = f"{own_span_s:.3g} s by its own clock and {stamped_s:.3g} s by its sidecar"
+        note(f"{video.name} runs for {spans}, which is used")
+
+
 def _stamps_of(sidecar: dict[str, Any], video: Path) -> tuple[np.ndarray, str]:
     for name, factor in _LISTS.items():
         values = sidecar.get(name)
         if isinstance(values, list) and values:
-            array = np.array(values, dtype=np.float64)
-            factor = factor or (1 if array[0] > 1e17 else 1_000_000 if array[0] > 1e11 else NS)
-            ns = [int(value) * factor if factor == 1 else round(float(value) * factor) for value in values]
-            return np.array(ns, dtype=np.int64), f"the list {name} of the sidecar"
+            return _listed_ns(
+                values, factor, f"{video.with_suffix('.json')}: {name}"
+            ), f"the list {name} of the sidecar"
     frames = [_flat(frame) for frame in sidecar.get("frames") or [] if isinstance(frame, dict)]
     for left, right in _EYES:
         if frames and all(_is_stamp(frame.get(left)) and _is_stamp(frame.get(right)) for frame in frames):
@@ -130,6 +148,16 @@ def _stamps_of(sidecar: dict[str, Any], video: Path) -> tuple[np.ndarray, str]:
     raise RecordingError(
         where=str(video.with_suffix(".json")), expected=expected, found=", ".join(sidecar) or "nothing"
     )
+
+
+def _listed_ns(values: list[Any], factor: int | None, where: str) -> np.ndarray:
+    """Stamps in ns; a list that does not name its unit shows it by its size."""
+    try:
+        factor = factor or (1 if values[0] > 1e17 else 1_000_000 if values[0] > 1e11 else NS)
+        ns = [int(value) * factor if factor == 1 else round(float(value) * factor) for value in values]
+        return np.array(ns, dtype=np.int64)
+    except (TypeError, ValueError, OverflowError) as problem:
+        raise RecordingError(where=where, expected="a list of numbers", found=str(problem)) from problem
 
 
 def _flat(frame: dict[str, Any]) -> dict[str, Any]:

@@ -5,6 +5,9 @@ from dataclasses import field
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
+STILL = ("none", "None", "null")
+"""Names of the laparoscope's arm that say there is none."""
+
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", allow_inf_nan=False))
 class ConvertSettings:

@@ -30,8 +30,8 @@ class TopicLogs:
         """One message."""
         ns = stamp_ns(message, received_ns)
         if topic in self._joints:
-            if len(message.position):
-                log = self._joints[topic]
+            log = self._joints[topic]
+            if _has_all_joints(message, log):
                 log.joint_ns.append(ns)
                 log.joints.append(np.array(message.position, dtype=np.float64))
                 log.joint_names = tuple(message.name)
@@ -46,3 +46,9 @@ class TopicLogs:
             log.is_local = log.is_local or frame.strip("/") == f"{log.name}_base"
         if topic in self._placings:
             self._placings[topic].add(ns, pose, frame)
+
+
+def _has_all_joints(message: Any, log: ArmLog) -> bool:
+    """Whether a JointState has as many positions as the log's first, or, itself the first, as it has names."""
+    count = len(message.position)
+    return count == len(log.joints[0]) if log.joints else count >= max(1, len(message.name))
