@@ -22,7 +22,7 @@ from rmis_calib.solver.estimate.map_estimate import MapEstimate
 from rmis_calib.solver.estimate.outliers import REJECTED
 from rmis_calib.solver.model.batched_linalg import unit_diagonal
 from rmis_calib.solver.model.measurement_rows import MeasurementRows
-from rmis_calib.solver.model.normal_equations import WeightedModel, group_sums, membership
+from rmis_calib.solver.model.normal_equations import WeightedModel, member_sums, membership
 from rmis_calib.solver.model.state import State
 from rmis_calib.solver.solution import GroupCheck
 
@@ -59,9 +59,14 @@ def check_groups(fit: MapEstimate, asked: int) -> GroupCheck:
         return GroupCheck.none(used, state.t)
     place = where_motions_are(measured)
     group = neighbours(place, used, count)
-    H_k, s_k = _sums(fit.model, state, group, count)
+    block = torch.arange(measured.motions, device=group.device) * count // measured.motions
+    in_time = membership(block.expand_as(group), count, state.t.dtype)
+    model, recounted = fit.model, _recounted(fit, in_time[0])
+    H_all, s_all = _sums(model, state, torch.cat((membership(group, count, state.t.dtype), in_time), dim=-1))
+    H_k, s_k = H_all[:, :count], s_all[:, :count]
     prior = fit.model.layout.sigma.square().reciprocal()
-    deviation, _ = fit.model.layout.prior(state)
+    deviation, _ = model.layout.prior(state)
+    H_t, s_t = (H_all[:, count:], s_all[:, count:]) if recounted is model else _sums(recounted, state, in_time)
     s_k = s_k - (s_k.sum(1) + prior * deviation)[:, None] / count  # what the bias correction left of the score
     H = H_k.sum(1) + torch.diag_embed(prior)
     rest = inverse(H[:, None] - H_k)
@@ -81,7 +86,8 @@ def check_groups(fit: MapEstimate, asked: int) -> GroupCheck:
     growth = root @ (turn * factor.sqrt()[:, None] @ turn.mT) @ inverse_root
     first_half = _first_half(place, group, count)
     halves, apart = _difference(H_k, s_k, prior, deviation, first_half[:, None], growth, inverse_root)
-    changes, change_apart = _changes_in_time(fit, growth, inverse_root, count)
+    before = torch.tril(torch.ones(count - 1, count, dtype=prior.dtype, device=prior.device)).expand(len(prior), -1, -1)
+    changes, change_apart = _difference(H_t, s_t, prior, deviation, before, growth, inverse_root)
     clearest = change_apart.argmax(-1)
     sigmas = torch.linalg.solve(extra + _RIDGE * eye, own[..., None])[..., 0]
     return GroupCheck(
@@ -121,10 +127,10 @@ def _growth(
 
 
 def _sums(
-    model: WeightedModel, state: State, group: Int[Tensor, "b n"], count: int
+    model: WeightedModel, state: State, member: Float[Tensor, "b n k"]
 ) -> tuple[Float[Tensor, "b k p p"], Float[Tensor, "b k p"]]:
     """Information and score of each group, without what is not finite."""
-    H_k, s_k = group_sums(model, state, group, count)
+    H_k, s_k = member_sums(model, state, member)
     return torch.nan_to_num(H_k), torch.nan_to_num(s_k)
 
 
@@ -174,28 +180,15 @@ def _first_half(place: Float[Tensor, "b n d"], group: Int[Tensor, "b n"], count:
     return torch.zeros_like(is_first).scatter(-1, order, is_first).to(place.dtype)
 
 
-def _changes_in_time(
-    fit: MapEstimate, growth: Float[Tensor, "b 6 6"], inverse_root: Float[Tensor, "b 6 6"], count: int
-) -> tuple[Float[Tensor, "b s 6"], Float[Tensor, "b s"]]:
-    """Difference of what comes before and after each border of `count` consecutive blocks, and in sigmas.
-
-    Where most motions of a block were rejected they count in full: a camera that was knocked looks like a block of
-    outliers.
-    """
-    measured, weight, b = fit.model.measured, fit.weight, fit.state.t.shape[0]
-    block = torch.arange(measured.motions, device=weight.device) * count // measured.motions
-    member = torch.nn.functional.one_hot(block, count).to(weight.dtype)
-    counted = measured.rows_seen > 0
-    share = (
-        ((weight < REJECTED) & counted).to(weight.dtype) @ member / (counted.to(weight.dtype) @ member).clamp_min(1.0)
-    )
-    mostly = (share > 0.5).any(0).to(weight.dtype) @ member.T > 0.5  # (b, n)
-    model = fit.model if fit.model.weight is None else replace(fit.model, weight=torch.where(mostly, 1.0, weight))
-    H_k, s_k = _sums(model, fit.state, block.expand(b, -1), count)
-    prior = fit.model.layout.sigma.square().reciprocal()
-    deviation, _ = fit.model.layout.prior(fit.state)
-    before = torch.tril(torch.ones(count - 1, count, dtype=weight.dtype, device=weight.device))
-    return _difference(H_k, s_k, prior, deviation, before.expand(b, -1, -1), growth, inverse_root)
+def _recounted(fit: MapEstimate, block: Float[Tensor, "n k"]) -> WeightedModel:
+    """The model for the comparison of blocks in time. Where most motions of a block were rejected they count in full: a
+    camera that was knocked looks like a block of outliers."""
+    if fit.model.weight is None:
+        return fit.model
+    weight, counted = fit.weight, fit.model.measured.rows_seen > 0
+    share = ((weight < REJECTED) & counted).to(weight.dtype) @ block / (counted.to(weight.dtype) @ block).clamp_min(1.0)
+    mostly = (share > 0.5).any(0).to(weight.dtype) @ block.T > 0.5  # (b, n)
+    return replace(fit.model, weight=torch.where(mostly, 1.0, weight))
 
 
 def _first_of_block(motions: int, count: int, block: Int[Tensor, " b"]) -> Int[Tensor, " b"]:

@@ -17,9 +17,11 @@ from torch import Tensor
 
 from rmis_calib.errors import InputError
 from rmis_calib.solver.model.batched_linalg import eliminate, forward_substitute
+from rmis_calib.solver.model.compliance import basis
+from rmis_calib.solver.model.grams import gram, gram_of_products
 from rmis_calib.solver.model.linearised_rows import LinearisedRows
 from rmis_calib.solver.model.measurement_rows import END, HEAD, LINE, OWN, MeasurementRows
-from rmis_calib.solver.model.parameters import ParameterLayout, columns
+from rmis_calib.solver.model.parameters import GIVEN_WAY, ParameterLayout, columns
 from rmis_calib.solver.model.predicted_shaft import Shaft
 from rmis_calib.solver.model.residuals import linearise
 from rmis_calib.solver.model.state import State
@@ -203,20 +205,29 @@ def normal_equations(model: WeightedModel, state: State, keep: bool = False) -> 
         image = image_variance(measured, model.noise)
         J = columns(layout, linear, shaft, measured, state)
         white, logdet = _whitened(model, linear, image, torch.cat((J, linear.r[:, None]), dim=1))
+        sums = gram(white, None)[:, 0]
     else:
         white, factor = _eliminated(model, state, linear, shaft)
         logdet = factor.diagonal(dim1=0, dim2=1).log().sum((-2, -1))
-    gram = torch.matmul(white.permute(0, 2, 1, 3), white.permute(0, 2, 3, 1)).sum(0)  # (b, p + 1, p + 1)
+        sums = _sums(model, white, None)[:, 0]
     return Normal(
-        H=gram[:, :p, :p],
-        g=gram[:, :p, p],
-        chi2=gram[:, p, p],
-        rows=measured.rows_ok.sum((0, 2)).to(gram.dtype),
+        H=sums[:, :p, :p],
+        g=sums[:, :p, p],
+        chi2=sums[:, p, p],
+        rows=measured.rows_ok.sum((0, 2)).to(sums.dtype),
         distance2=white[:, -1].square().sum(0),
         logdet=logdet,
         factor=factor if keep else None,
         linear=linear if keep else None,
     )
+
+
+def _sums(
+    model: WeightedModel, white: Float[Tensor, "k q b n"], member: Float[Tensor, "b n g"] | None
+) -> Float[Tensor, "b g p p"]:
+    """Products of all columns, summed over the motions of each group, from whitened columns of the folded layout."""
+    part = model.layout.folded.blocks.get(GIVEN_WAY)
+    return gram(white, member) if part is None else gram_of_products(white, member, part, basis(model.measured.pose))
 
 
 def membership(group: Int[Tensor, "b n"], count: int, dtype: torch.dtype) -> Float[Tensor, "b n g"]:
@@ -228,6 +239,13 @@ def group_sums(
     model: WeightedModel, state: State, group: Int[Tensor, "b n"], count: int
 ) -> tuple[Float[Tensor, "b g p p"], Float[Tensor, "b g p"]]:
     """Information and score of `count` groups of motions, without priors; motions of no group (-1) do not count."""
+    return member_sums(model, state, membership(group, count, state.t.dtype))
+
+
+def member_sums(
+    model: WeightedModel, state: State, member: Float[Tensor, "b n g"]
+) -> tuple[Float[Tensor, "b g p p"], Float[Tensor, "b g p"]]:
+    """Information and score, without priors, of groups that may overlap."""
     sums = []
     for trials, along in model.parts():
         at, total = state.take(trials), None
@@ -235,12 +253,8 @@ def group_sums(
             part = model.narrow(trials, motions)
             linear, shaft = linearise(part.measured, at)
             white, _ = _eliminated(part, at, linear, shaft)
-            member = membership(group[trials, motions], count, white.dtype)
-            columns_last = white.permute(2, 0, 3, 1)  # (b, k, n, p + 1)
-            gram = torch.stack(
-                [(columns_last.mT @ (columns_last * one[:, None, :, None])).sum(1) for one in member.unbind(-1)], dim=1
-            )
-            total = gram if total is None else total + gram
+            found = _sums(part, white, member[trials, motions])
+            total = found if total is None else total + found
         assert total is not None
         sums.append(total)
     joined = torch.cat(sums)
@@ -250,8 +264,9 @@ def group_sums(
 def _eliminated(
     model: WeightedModel, state: State, linear: LinearisedRows, shaft: Shaft
 ) -> tuple[Float[Tensor, "k q b n"], Tensor]:
-    """L^-1 [J r] of every motion, with S = L L^T, and the eliminated systems; in place, not for autograd."""
-    measured, layout = model.measured, model.layout
+    """L^-1 [J r] of every motion, with S = L L^T and the columns of the folded layout, and the eliminated systems; in
+    place, not for autograd."""
+    measured, layout = model.measured, model.layout.folded
     k, b, n = linear.r.shape
     image = image_variance(measured, model.noise)
     augmented = torch.empty((k, k + layout.size + 1, b, n), dtype=linear.r.dtype, device=linear.r.device)

@@ -19,6 +19,8 @@ from rmis_calib.solver.model.state import State
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import NoiseSettings, UnknownSettings
 
+GIVEN_WAY = "given_way"
+"""Block of a folded layout."""
 UNITS = {
     "stereo_rotation": "rad",
     "stereo_translation": "mm",
@@ -57,6 +59,22 @@ class ParameterLayout:
     @property
     def size(self) -> int:
         return self.sigma.shape[-1]
+
+    @property
+    def folded(self) -> "ParameterLayout":
+        """The same with the components of what gives way, under the name GIVEN_WAY, in the place of their products with
+        the functions of the pose."""
+        if "compliance" not in self.blocks:
+            return self
+        blocks, sigma, start = {}, [], 0
+        for name, part in self.blocks.items():
+            each = self.sigma[:, part]
+            if name == "compliance":
+                name, each = GIVEN_WAY, each[:, ::FUNCTIONS]
+            blocks[name] = slice(start, start + each.shape[-1])
+            sigma.append(each)
+            start += each.shape[-1]
+        return ParameterLayout(blocks, torch.cat(sigma, dim=-1), self.origin)
 
     def step(self, delta: Float[Tensor, "b p"]) -> dict[str, Tensor]:
         """A parameter vector cut into blocks."""
@@ -305,11 +323,11 @@ def _displaced(name: str, linear: LinearisedRows, measured: MeasurementRows, sta
         return torch.stack([dot(linear.w, rotate(R, e)[:, None]) for e in rcm_axes(measured.R, measured.v)])
     if measured.joint is not None and name == "joint_offset":
         return torch.stack([_effect(linear, R, motion) for motion in measured.joint.unbind(1)])
-    if name == "compliance":
+    if name in ("compliance", GIVEN_WAY):
         axes = [rotate(R, e)[:, None] for e in (*rcm_axes(measured.R, measured.v), measured.v)]
         turns, shifts = [dot(linear.a, e) for e in axes[:TURNS]], [dot(linear.w, e) for e in axes]
         effects = torch.stack((*turns, *shifts))
-        return (effects[:, None] * basis(measured.pose)[:, None]).flatten(0, 1)
+        return effects if name == GIVEN_WAY else (effects[:, None] * basis(measured.pose)[:, None]).flatten(0, 1)
     if measured.setup is not None and name == "setup":
         return torch.stack([_effect(linear, R, motion) for motion in measured.setup.unbind(1)])
     if measured.clock is not None and name == "clock":
