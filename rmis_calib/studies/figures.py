@@ -19,6 +19,8 @@ _PANEL_HEIGHT_IN = 1.9
 _LEGEND_LINE_IN = 0.16
 _APART = 0.09
 """Points without a line that share their x stand side by side: the distance from one method to the next."""
+_ASIDE = 0.009
+"""So do the ranges of curves, but nearer: this part of the axis from one to the next."""
 _MOST_TICKS = 12
 _FINE = 60.0
 """Axes that span less get numbers between the decades."""
@@ -94,11 +96,12 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
     axes.set_yscale("log")
     if panel.x_is_log:
         axes.set_xscale("log")
+    methods = sum(not series.style.is_bound for series in panel.series)
     for series in panel.series:
         if series.style.is_bound:
             _draw_bound(axes, series)
         else:
-            _draw_method(axes, series, len(panel.series))
+            _draw_method(axes, series, panel, series.style.index - 0.5 * (methods - 1))
     if panel.y_line is not None:
         axes.axhline(panel.y_line[0], color="#5b5b5b", linewidth=0.8, linestyle=(0, (1, 2)), label=panel.y_line[1])
     axes.grid(axis="y", color="#d9d9d9", linewidth=0.5)
@@ -127,12 +130,21 @@ def _ticks(values: list[float]) -> list[float]:
     return kept[::-1]
 
 
-def _draw_method(axes: Axes, series: Series, methods: int) -> None:
+def _beside(x: np.ndarray, panel: Panel, series: Series, steps: float) -> np.ndarray:
+    """Where points stand whose ranges would lie on each other's: so many steps aside."""
+    if not series.style.has_line:
+        return x + _APART * steps if series.style.is_named else x
+    values = [value for own in panel.series for value in own.x]
+    least, most = min(values), max(values)
+    return x * (most / least) ** (_ASIDE * steps) if panel.x_is_log else x + _ASIDE * steps * (most - least)
+
+
+def _draw_method(axes: Axes, series: Series, panel: Panel, steps: float) -> None:
+    """A curve with its ranges, `steps` aside."""
     place = series.style.index % len(COLOURS)
     shown = np.isfinite(series.middle)
     x, middle, low, high = (np.asarray(v)[shown] for v in (series.x, series.middle, series.low, series.high))
-    if series.style.is_named and not series.style.has_line:
-        x = x + _APART * (series.style.index - 0.5 * (methods - 1))
+    x = _beside(x, panel, series, steps)
     colour = COLOURS[place]
     bars = np.stack([middle - low, np.where(np.isfinite(high), high, middle) - middle])
     axes.errorbar(

@@ -125,21 +125,38 @@ def _least_enough(table: "pyarrow.Table", ready: Ready, settings: PlanSettings) 
 
 
 def _sentences(table: "pyarrow.Table", enough: int | None, ready: Ready, settings: PlanSettings) -> list[str]:
-    share = f"{100 * settings.confidence:g} % of recordings"
     wanted = f"{settings.wanted_mm:g} mm at the working point"
     wanted += "" if settings.wanted_deg is None else f" and {settings.wanted_deg:g} deg"
-    trials = settings.n_trials
     at = enough or settings.most_motions
     mm, deg = _reached(table, at, ready, settings)
-    found = f"{share} are within {mm:.2g} mm and {deg:.2g} deg ({trials} simulated, {ready.cameras[0]})"
-    if enough is None:
-        answer = f"{settings.most_motions} motions are not enough for {wanted}: with them {found}."
-    else:
-        answer = f"{enough} motions reach {wanted}: {found}."
+    share = f"{100 * settings.confidence:g} % of {settings.n_trials} simulated recordings ({ready.cameras[0]})"
+    found = f"in {share} the error is below {mm:.2g} mm and {deg:.2g} deg"
+    answer = f"{at} motions are {'not enough' if enough is None else 'enough'} for {wanted}: {found}."
+    if enough is None and np.isfinite(mm):
+        excess = max(mm / settings.wanted_mm, deg / (settings.wanted_deg or np.inf))
+        answer += (
+            f" Errors fall with the square root of the number: expect to need about {_two_digits(at * excess**2):,}."
+        )
     return [
         answer,
-        "This counts independent noise alone: encoder offsets, lens and other errors that motions share are not in it.",
+        f"Assumed noise, 1 sigma per axis: {_noise_in_words(ready, settings)}.",
+        "Errors that all motions share (encoder offsets, lens, a bent shaft) are not simulated and do not average out: "
+        "take this number as the minimum.",
     ]
+
+
+def _two_digits(number: float) -> int:
+    """A whole number with two digits that count."""
+    return int(round(number, 1 - int(np.log10(number))))
+
+
+def _noise_in_words(ready: Ready, settings: PlanSettings) -> str:
+    points = f"image points {settings.setup.pixel_noise_px:g} px"
+    if ready.sources:
+        return f"{points}; {ready.sources[0].title}, coefficient {settings.coefficient:g}"
+    kinematics = f"kinematics {settings.kinematics_noise_mm:g} mm, {settings.kinematics_noise_deg:g} deg"
+    stereo = f"stereo extrinsics {settings.stereo_noise_mm:g} mm, {settings.stereo_noise_deg:g} deg"
+    return f"{kinematics}; {points}; {stereo}"
 
 
 def _figure(groups: Sequence[Group], ready: Ready, settings: PlanSettings) -> Figure:

@@ -127,5 +127,7 @@ def _note(group: Group, measure: str, bound: bool) -> str:
     unit = MEASURES[measure]
     if bound:
         return f"{grid}: rms {group.bound_rms[measure]:.3g} {unit}"
-    text = f"{grid}: rms {group.rms[measure]:.3g} {unit}, 90 % below {group.quartiles[measure][3]:.3g} {unit}"
-    return text + (f", {group.unanswered} of {group.count} without an answer" if group.unanswered else "")
+    text = f"{grid}: rms {group.rms[measure]:.3g} {unit}"
+    if np.isfinite(group.quartiles[measure][3]):
+        text += f", 90 % below {group.quartiles[measure][3]:.3g} {unit}"
+    return text + (f", {group.unanswered} of {group.count} without a usable answer" if group.unanswered else "")

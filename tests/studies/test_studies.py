@@ -265,7 +265,8 @@ def test_the_plan_finds_the_number_of_motions(tmp_path) -> None:
     result = rc.study_plan(tmp_path / "out", settings)
     assert result.reached
     assert result.sentences[0].startswith(
-        "104 motions reach 1 mm at the working point: 90 % of recordings are within 0.98"
+        "104 motions are enough for 1 mm at the working point: in 90 % of 2 simulated recordings (stereo) the error is "
+        "below 0.98 mm"
     )
     assert {row["motions"] for row in result.summary} == {
         4,
@@ -288,6 +289,7 @@ def test_the_plan_finds_the_number_of_motions(tmp_path) -> None:
     result = rc.study_plan(tmp_path / "out", replace(settings, wanted_mm=0.5))
     assert not result.reached
     assert "200 motions are not enough for 0.5 mm" in result.sentences[0]
+    assert "expect to need about 400" in result.sentences[0]  # (10 / 0.5)^2
 
 
 def test_folders_of_others_are_left_alone(tmp_path) -> None:

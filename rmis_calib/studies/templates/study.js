@@ -59,9 +59,12 @@
     node("text", { x: 11, y: (H - M.bottom + M.top) / 2, "text-anchor": "middle", transform: `rotate(-90 11 ${(H - M.bottom + M.top) / 2})` }, svg, panel.y_label);
     if (panel.y_line) {
       node("line", { class: "level", x1: M.left, x2: W - M.right, y1: y(panel.y_line[0]), y2: y(panel.y_line[0]) }, svg);
-      node("text", { x: W - M.right, y: y(panel.y_line[0]) - 4, "text-anchor": "end" }, svg, panel.y_line[1]);
     }
     for (const series of panel.series) curve(svg, series, x, y);
+    if (panel.y_line) {
+      const level = y(panel.y_line[0]), below = level + 18 < H - M.bottom;  // errors lie above what they approach
+      node("text", { x: W - M.right, y: level + (below ? 13 : -4), "text-anchor": "end", class: "name" }, svg, panel.y_line[1]);
+    }
     const cross = node("line", { class: "cross", y1: M.top, y2: H - M.bottom }, svg);
     svg.addEventListener("pointermove", event => point(event, svg, panel, xs, x, cross));
     svg.addEventListener("pointerleave", () => { tip.hidden = true; cross.style.visibility = "hidden"; });
