@@ -29,7 +29,7 @@ from rmis_calib.solver.start.candidates import best_candidate
 from rmis_calib.solver.start.line_statistics import LineStatistics
 from rmis_calib.solver.start.paper import average, empirical_covariance, influence, solve_paper, votes
 from rmis_calib.solver.status import MotionReason
-from rmis_calib.solver.tensors import map_tensors
+from rmis_calib.solver.tensors import map_tensors, spans
 
 GROUP_MOTIONS = 32768
 """Motions (times trials) that are solved together: a batch of trials is cut into groups whose tensors stay in the
@@ -92,10 +92,7 @@ def _solve_groups(
     alone = kinematics is not None or alternative is not None or settings.thin_to is not None
     if flat.n_trials <= count or alone:
         return _solve_by_evidence(flat, settings, method, kinematics, alternative)
-    groups = [
-        _solve_by_evidence(flat.take_trials(slice(b, b + count)), settings, method)
-        for b in range(0, flat.n_trials, count)
-    ]
+    groups = [_solve_by_evidence(flat.take_trials(part), settings, method) for part in spans(flat.n_trials, count)]
     return concatenate(groups)
 
 

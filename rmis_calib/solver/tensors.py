@@ -1,11 +1,25 @@
 """Dataclasses of tensors: the axes that their annotations tell, and one function for all tensors in them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass, replace
 from functools import cache
 from typing import Any, get_args
 
 from torch import Tensor
+
+
+def spans(count: int, at_once: int) -> Iterator[slice]:
+    """Slices of at most `at_once` (1 or more) that make up `count`, in order: what keeps memory bounded."""
+    at_once = max(1, at_once)
+    for start in range(0, count, at_once):
+        yield slice(start, min(start + at_once, count))
+
+
+def chunks(trials: int, motions: int, chunk: int) -> Iterator[tuple[slice, list[slice]]]:
+    """Slices of trials, each with the slices of motions, that hold `chunk` motions (times trials) or fewer."""
+    along = list(spans(motions, chunk))
+    for part in spans(trials, chunk // max(1, min(motions, chunk))):
+        yield part, along
 
 
 @cache

@@ -26,6 +26,7 @@ from rmis_calib.solver.settings import Method, SolverSettings
 from rmis_calib.solver.solution import AlternativeModel, GroupCheck, Nuisance, Posterior, SetupEstimate, Solution
 from rmis_calib.solver.start.candidates import COLLAPSED_MM, collapsed
 from rmis_calib.solver.status import MotionReason, SolveStatus
+from rmis_calib.solver.tensors import spans
 
 MIN_CHEIRALITY = 0.5
 CHECKED_MOTIONS = 256
@@ -326,10 +327,8 @@ class _Residuals:
 
 def _residuals(measured: MeasurementRows, state: State) -> _Residuals:
     """Residuals of all motions, a long recording in parts."""
-    step = max(1, 8 * SHOWN_MOTIONS // measured.trials)
-    parts = [
-        _residuals_of(measured.narrow(slice(None), slice(n, n + step)), state) for n in range(0, measured.motions, step)
-    ]
+    step = 8 * SHOWN_MOTIONS // measured.trials
+    parts = [_residuals_of(measured.narrow(slice(None), part), state) for part in spans(measured.motions, step)]
     lines, ends, heads, *own = (torch.cat(each, dim=-1) for each in zip(*parts, strict=True))
     names = [(rows.name, rows.camera) for rows in measured.own]
     by_name = {name: value[:, camera] for (name, camera), value in zip(names, own, strict=True)}

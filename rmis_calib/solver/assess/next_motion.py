@@ -23,6 +23,7 @@ from rmis_calib.solver.model.state import State
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import SolverSettings
 from rmis_calib.solver.solution import Posterior
+from rmis_calib.solver.tensors import spans
 
 SHORTEST_VISIBLE_MM = 10.0
 """Of a shaft in view."""
@@ -166,8 +167,8 @@ def predicted_information(
         settings: as in the estimate.
     """
     each, seen = [], []
-    for n in range(0, candidates.n_motions, settings.chunk):
-        part = candidates.select_motions(slice(n, n + settings.chunk))
+    for span in spans(candidates.n_motions, settings.chunk):
+        part = candidates.select_motions(span)
         measured, visible = _predicted(pack(part, settings.noise), posterior.state, view, settings.advice.nearest_mm)
         each.append(motion_information(WeightedModel(measured, posterior.layout, posterior.noise), posterior.state)[0])
         seen.append(visible)

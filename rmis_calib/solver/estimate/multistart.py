@@ -20,6 +20,7 @@ from rmis_calib.solver.start.candidates import contour_starts, find_candidates
 from rmis_calib.solver.start.from_points import point_starts
 from rmis_calib.solver.start.line_statistics import LineStatistics
 from rmis_calib.solver.start.robust import robust_candidates
+from rmis_calib.solver.tensors import spans
 
 START_ITERATIONS = 12
 START_TOLERANCE = 0.1
@@ -173,9 +174,7 @@ def race(
     b, s = R.shape[:2]
     nominal = NuisancePriors.of(problem)
     states, kept = [], []
-    step = max(1, settings.chunk // (s * sample.motions))
-    for start in range(0, b, step):
-        part = slice(start, min(start + step, b))
+    for part in spans(b, settings.chunk // (s * sample.motions)):
         many = sample.narrow(part, slice(None)).repeat_trials(s)
         noise = assumed.take(part).repeat(s)
         narrowed = nominal.repeat(part, s)

@@ -5,7 +5,7 @@ the restricted likelihood, and outliers that one of them rejects are noise to th
 from what robots and cameras have, the rivals are tried too, and the one of the greatest posterior is taken.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -58,82 +58,88 @@ def settle_noise(
         compete: whether rivals are tried; not where the levels to set out from won before.
     """
     sample = model.take_motions(order[:SAMPLE_MOTIONS]) if model.measured.motions > SAMPLE_MOTIONS else model
+    search = _Search(sample, contaminated, assumed, free, settings)
     if not any_free(free):
-        return _anneal(sample, state, contaminated, settings), sample.noise
-    settled, noise = _settle(sample, state, contaminated, assumed, free, settings)
-    at = torch.nonzero(_unusual(sample, noise, assumed, free, settings))[:, 0]
+        return search.annealed(state), sample.noise
+    settled, noise = search.settled(state)
+    at = torch.nonzero(search.unusual(noise))[:, 0]
     if not compete or not len(at):
         return settled, noise
-    part, start, mixed = sample.take_trials(at), state.take(at), contaminated[at]
-    own, own_free = assumed.take(at), {name: value[at] for name, value in free.items()}
-    best_state, best_noise = settled.take(at), noise.take(at)
-    best = _log_posterior(replace(part, noise=best_noise), best_state, mixed, own, own_free, settings)
-    for factor in RIVALS:
-        levels = _with_kinematics(part.noise, own, own_free, factor)
-        rival_state, rival = _settle(replace(part, noise=levels), start, mixed, own, own_free, settings)
-        value = _log_posterior(replace(part, noise=rival), rival_state, mixed, own, own_free, settings)
-        better = torch.nonzero(value > best + CLEARLY)[:, 0]
-        best_state = best_state.put(better, rival_state.take(better))
-        best_noise = best_noise.put(better, rival.take(better))
-        best = torch.where(value > best + CLEARLY, value, best)
+    best_state, best_noise = search.best_of_rivals(at, state.take(at), settled.take(at), noise.take(at))
     return settled.put(at, best_state), noise.put(at, best_noise)
 
 
-def _settle(
-    sample: WeightedModel,
-    state: State,
-    contaminated: Bool[Tensor, " b"],
-    assumed: NoiseModel,
-    free: dict[str, Tensor],
-    settings: SolverSettings,
-) -> tuple[State, NoiseModel]:
-    """Outliers annealed away at the model's levels, then levels and state in turn."""
-    state = _anneal(sample, state, contaminated, settings)
-    for _ in range(NOISE_ROUNDS):
-        weight = classify_contaminated(sample, state, contaminated, settings.outlier_probability)
-        sample = replace(sample, weight=weight)
-        sample = replace(sample, noise=estimate_components(sample, state, assumed, free, settings.noise))
-        state = gauss_newton(sample, state, 0.1, 4).state
-    return state, sample.noise
+@dataclass(frozen=True)
+class _Search:
+    """What the noise levels of some trials are found from: the arguments of `settle_noise`."""
 
+    sample: WeightedModel
+    contaminated: Bool[Tensor, " b"]
+    assumed: NoiseModel
+    free: dict[str, Tensor]
+    settings: SolverSettings
 
-def _anneal(sample: WeightedModel, state: State, contaminated: Bool[Tensor, " b"], settings: SolverSettings) -> State:
-    at = torch.nonzero(contaminated)[:, 0]
-    if not len(at):
-        return state
-    return state.put(at, anneal(sample.take_trials(at), state.take(at), settings.outlier_probability)[0])
+    def take(self, at: Tensor) -> "_Search":
+        """The search of the trials `at`."""
+        free = {name: value[at] for name, value in self.free.items()}
+        return _Search(self.sample.take_trials(at), self.contaminated[at], self.assumed.take(at), free, self.settings)
 
+    def annealed(self, state: State) -> State:
+        """The state with outliers annealed away in contaminated trials."""
+        at = torch.nonzero(self.contaminated)[:, 0]
+        if not len(at):
+            return state
+        probability = self.settings.outlier_probability
+        return state.put(at, anneal(self.sample.take_trials(at), state.take(at), probability)[0])
 
-def _unusual(
-    sample: WeightedModel, noise: NoiseModel, assumed: NoiseModel, free: dict[str, Tensor], settings: SolverSettings
-) -> Bool[Tensor, " b"]:
-    """Trials of which some estimated level is far from the assumed one."""
-    centre, weight = log_prior(assumed, settings.noise)
-    away = (log_levels(noise) - centre).abs() * weight**0.5
-    return (free_components(sample.measured, free) & (away > USUAL)).any(-1)
+    def settled(self, state: State, noise: NoiseModel | None = None) -> tuple[State, NoiseModel]:
+        """Outliers annealed away at the levels to set out from (None: the sample's), then levels and state in turn."""
+        search = self if noise is None else replace(self, sample=replace(self.sample, noise=noise))
+        sample, state = search.sample, search.annealed(state)
+        for _ in range(NOISE_ROUNDS):
+            sample = replace(sample, weight=search.weight(sample, state))
+            levels = estimate_components(sample, state, self.assumed, self.free, self.settings.noise)
+            sample = replace(sample, noise=levels)
+            state = gauss_newton(sample, state, 0.1, 4).state
+        return state, sample.noise
 
+    def best_of_rivals(self, at: Tensor, start: State, state: State, noise: NoiseModel) -> tuple[State, NoiseModel]:
+        """State and levels of the greatest posterior of the trials `at`, among those given and where rivals settle."""
+        search = self.take(at)
+        best = search.log_posterior(state, noise)
+        for factor in RIVALS:
+            rival_state, rival = search.settled(start, search.kinematics_times(factor))
+            value = search.log_posterior(rival_state, rival)
+            better = torch.nonzero(value > best + CLEARLY)[:, 0]
+            state = state.put(better, rival_state.take(better))
+            noise = noise.put(better, rival.take(better))
+            best = torch.where(value > best + CLEARLY, value, best)
+        return state, noise
 
-def _with_kinematics(noise: NoiseModel, assumed: NoiseModel, free: dict[str, Tensor], factor: float) -> NoiseModel:
-    """The levels with the kinematic ones, where they are free, `factor` times the assumed ones."""
-    changed = {
-        name: torch.where(free[name], factor**2 * getattr(assumed, name), getattr(noise, name))
-        for name in ("kinematics_mm", "kinematics_rad")
-    }
-    return replace(noise, **changed)
+    def weight(self, model: WeightedModel, state: State) -> Float[Tensor, "c b n"] | None:
+        """Of the measurements, nearly 0 for outliers."""
+        return classify_contaminated(model, state, self.contaminated, self.settings.outlier_probability)
 
+    def unusual(self, noise: NoiseModel) -> Bool[Tensor, " b"]:
+        """Trials of which some estimated level is far from the assumed one."""
+        centre, weight = log_prior(self.assumed, self.settings.noise)
+        away = (log_levels(noise) - centre).abs() * weight**0.5
+        return (free_components(self.sample.measured, self.free) & (away > USUAL)).any(-1)
 
-def _log_posterior(
-    model: WeightedModel,
-    state: State,
-    contaminated: Bool[Tensor, " b"],
-    assumed: NoiseModel,
-    free: dict[str, Tensor],
-    settings: SolverSettings,
-) -> Float[Tensor, " b"]:
-    """Of the levels. A rejected measurement counts as one of a distribution a thousand times as wide (its weight), so
-    that modes that reject more do not win by that."""
-    weight = classify_contaminated(model, state, contaminated, settings.outlier_probability)
-    likelihood = restricted_likelihood(replace(model, weight=weight), state)
-    centre, prior = log_prior(assumed, settings.noise)
-    away = torch.where(free_components(model.measured, free), log_levels(model.noise) - centre, 0.0)
-    return likelihood - 0.5 * prior * away.square().sum(-1)
+    def kinematics_times(self, factor: float) -> NoiseModel:
+        """The sample's levels with the kinematic ones, where they are free, `factor` times the assumed ones."""
+        noise = self.sample.noise
+        changed = {
+            name: torch.where(self.free[name], factor**2 * getattr(self.assumed, name), getattr(noise, name))
+            for name in ("kinematics_mm", "kinematics_rad")
+        }
+        return replace(noise, **changed)
+
+    def log_posterior(self, state: State, noise: NoiseModel) -> Float[Tensor, " b"]:
+        """Of the levels. A rejected measurement counts as one of a distribution a thousand times as wide (its weight),
+        so that modes that reject more do not win by that."""
+        model = replace(self.sample, noise=noise)
+        likelihood = restricted_likelihood(replace(model, weight=self.weight(model, state)), state)
+        centre, prior = log_prior(self.assumed, self.settings.noise)
+        away = torch.where(free_components(model.measured, self.free), log_levels(noise) - centre, 0.0)
+        return likelihood - 0.5 * prior * away.square().sum(-1)

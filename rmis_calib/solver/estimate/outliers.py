@@ -23,6 +23,7 @@ from torch import Tensor
 from rmis_calib.solver.estimate.gauss_newton import solve_system
 from rmis_calib.solver.model.normal_equations import WeightedModel, camera_distance2, normal_equations, with_prior
 from rmis_calib.solver.model.state import State
+from rmis_calib.solver.tensors import spans
 
 MIN_WEIGHT = 1e-6
 REJECTED = 0.5
@@ -103,10 +104,10 @@ def classify(
         limit = torch.where(rows > 0, limit, torch.inf).amin(0)
         trial, motion = torch.nonzero(~(distance2 <= limit) & (rows.sum(0) > 0), as_tuple=True)
         weight = torch.ones_like(rows, dtype=distance2.dtype)
-        for k in range(0, len(trial), model.chunk):
-            b, n = trial[k : k + model.chunk], motion[k : k + model.chunk]
-            part = inlier_weight(*camera_distance2(measured.gather(b, n), state.take(b), noise.take(b)), probability)
-            weight[:, b, n] = part[:, :, 0]
+        for part in spans(len(trial), model.chunk):
+            b, n = trial[part], motion[part]
+            each = inlier_weight(*camera_distance2(measured.gather(b, n), state.take(b), noise.take(b)), probability)
+            weight[:, b, n] = each[:, :, 0]
         return weight
     weights = []
     for trials, along in model.parts():

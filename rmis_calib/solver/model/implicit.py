@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rmis_calib.solver.model.batched_linalg import rescaled
+
 
 def newton_on_graph(
     equation: Callable[[Float[Tensor, "*batch k"]], Float[Tensor, "*batch k"]], like: Float[Tensor, "*batch k"]
@@ -28,6 +30,6 @@ def newton_on_graph(
         slope = torch.stack(rows, dim=-2)
         # Radians and millimetres mix once every row and column is of one size.
         size = slope.diagonal(dim1=-2, dim2=-1).abs().clamp_min(1e-300).rsqrt()
-        scaled = slope * size[..., :, None] * size[..., None, :]
+        scaled = rescaled(slope, size)
         solved = torch.linalg.solve_ex(scaled, (size * value)[..., None]).result[..., 0]
         return -size * solved

@@ -25,6 +25,7 @@ from rmis_calib.solver.model.parameters import GIVEN_WAY, ParameterLayout, colum
 from rmis_calib.solver.model.predicted_shaft import Shaft
 from rmis_calib.solver.model.residuals import linearise
 from rmis_calib.solver.model.state import State
+from rmis_calib.solver.tensors import chunks
 
 
 @dataclass(frozen=True)
@@ -95,15 +96,6 @@ class WeightedModel:
     def parts(self) -> Iterator[tuple[slice, list[slice]]]:
         """Slices of trials, each with the slices of motions, that hold `chunk` motions or fewer."""
         return chunks(self.measured.trials, self.measured.motions, self.chunk)
-
-
-def chunks(trials: int, motions: int, chunk: int) -> Iterator[tuple[slice, list[slice]]]:
-    """Slices of trials, each with the slices of motions, that hold `chunk` motions (times trials) or fewer."""
-    step_n = max(1, min(motions, chunk))
-    step_b = max(1, chunk // step_n)
-    along = [slice(n, min(n + step_n, motions)) for n in range(0, motions, step_n)]
-    for b in range(0, trials, step_b):
-        yield slice(b, min(b + step_b, trials)), along
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from torch import Tensor
 from rmis_calib.errors import InputError
 from rmis_calib.geometry.lines import plane_normal_from_points
 from rmis_calib.solver.problem import Problem
+from rmis_calib.solver.tensors import chunks
 
 SAMPLE = 64
 """Motions kept as they are, for the test whether the visible part of the shaft is in front of the camera."""
@@ -89,14 +90,9 @@ class LineStatistics:
         """Sums of a problem with one trial axis, `chunk` motions (times trials) at a time; lines that were not
         measured do not count."""
         trials, motions = problem.n_trials, problem.n_motions
-        step_n = min(motions, chunk)
-        step_b = max(1, chunk // step_n)
         sums = []
-        for b in range(0, trials, step_b):
-            parts = [
-                _sums(problem, slice(b, min(b + step_b, trials)), slice(n, min(n + step_n, motions)))
-                for n in range(0, motions, step_n)
-            ]
+        for part, along in chunks(trials, motions, chunk):
+            parts = [_sums(problem, part, each) for each in along]
             total = parts[0]
             for part in parts[1:]:
                 total = [x.add_(y) for x, y in zip(total, part, strict=True)]
