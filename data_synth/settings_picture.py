@@ -56,7 +56,9 @@ class CameraSettings:
     exposure_s: NonNegative = 0.0
     """Exposure time: motion blur, centred on the frame's time."""
     readout_s: NonNegative = 0.0
-    """Time from reading the first row to the last (rolling shutter); the middle row is read at the frame's time."""
+    """Time of reading all rows (rolling shutter); the middle row is read at the frame's time."""
+    readout_told: bool = False
+    """Whether recording.yaml tells it (`rolling_shutter_s`); frame_times.csv then has the times of the first rows."""
     field_delay_s: NonNegative = 0.0
     """Interlaced: odd rows are taken this long after the even ones, half before and half after the frame's time; 0: not
     so."""

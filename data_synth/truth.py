@@ -48,6 +48,7 @@ class SideTruth:
         end_front_uv: (N, 2) the same in raw pixels.
         head_xy: (N, 2) projection of the head point.
         head_uv: (N, 2) the same in raw pixels.
+        head_uv_read: (N, 2) where the picture shows it, whose rows are read one after the other.
         visible: (N,) whether enough of the shaft is in the picture.
         end_visible: (N,) whether the shaft's end is.
         others: the same of every instrument that is not logged; their RCM frame is parallel to the camera.
@@ -70,6 +71,7 @@ class SideTruth:
     end_front_uv: Array
     head_xy: Array
     head_uv: Array
+    head_uv_read: Array
     visible: Array
     end_visible: Array
 
@@ -141,6 +143,7 @@ def _shaft_truth(world: World, side: str, shaft_at: Callable[[Array], ShaftInCam
         end_front_uv=camera.project(front),
         head_xy=to_image(shaft.camera_p_head),
         head_uv=camera.project(shaft.camera_p_head),
+        head_uv_read=_head_as_read(world, side, shaft_at),
         visible=visible,
         end_visible=end_visible,
     )
@@ -164,6 +167,17 @@ def _as_read(
         row = np.nan_to_num(camera.pixels(xy)[..., 1])
         times = frame_times + settings.readout_s * ((row + 0.5) / settings.height_px - 0.5)
     return np.where(seen[..., None], xy, np.nan)
+
+
+def _head_as_read(world: World, side: str, shaft_at: Callable[[Array], ShaftInCamera]) -> Array:
+    """The head point (N, 2), raw pixels, at the instant at which its row is read."""
+    settings, times = world.config.camera, world.frame_times_s
+    uv = world.cameras[side].project(shaft_at(times).camera_p_head)
+    for _ in range(3 if settings.readout_s else 0):  # as in `_as_read`
+        row = np.nan_to_num(uv[:, 1]).clip(0.0, settings.height_px - 1.0)
+        at = times + settings.readout_s * ((row + 0.5) / settings.height_px - 0.5)
+        uv = world.cameras[side].project(shaft_at(at).camera_p_head)
+    return uv
 
 
 def _straight(xy: Array, n_contour: Array) -> Array:

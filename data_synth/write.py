@@ -93,18 +93,29 @@ def _write_tables(folder: Path, world: World, truths: dict[str, SideTruth]) -> N
     recording |= {"joints": "joints.csv", "frame_times": "frame_times.csv"}
     recording |= {"laparoscope_arm": "laparoscope" if logged else None, "instrument_arm": "instrument"}
     recording |= {"shaft_diameter_mm": config.scene.shaft_diameter_mm + config.noise.shaft_diameter_error_mm}
+    if config.camera.readout_told:
+        recording["rolling_shutter_s"] = _first_to_last_row_s(world)
     _write_yaml(folder / "recording.yaml", recording)
     _write_yaml(folder / "robot.yaml", scene.robot_dict("synthetic-rcm-3x3", laparoscope=logged))
     _write_yaml(folder / "stereo.yaml", _stereo(world, generator))
     header, rows, offsets = _joint_log(world, logged, generator)
     _write_csv(folder / "joints.csv", header, rows)
     timing_error_s = config.noise.timestamp_noise_s * generator.standard_normal(len(world.frame_times_s))
-    times = ((i, _text(t)) for i, t in enumerate(np.sort(world.frame_times_s + timing_error_s)))
+    stamps_s = np.sort(world.frame_times_s + timing_error_s)
+    if config.camera.readout_told:
+        stamps_s = stamps_s - 0.5 * _first_to_last_row_s(world)
+    times = ((i, _text(t)) for i, t in enumerate(stamps_s))
     _write_csv(folder / "frame_times.csv", ["frame", "timestamp_s"], times)
     _write_head_points(folder / "head_points.csv", world, truths, generator)
     _write_yaml(folder / "ground_truth.yaml", ground_truth(world) | {"joint_offsets": offsets})
     arrays: dict[str, Any] = {f"{side}_{key}": value for side, t in truths.items() for key, value in t.arrays().items()}
     np.savez_compressed(folder / "truth.npz", **arrays, frame_times_s=world.frame_times_s)
+
+
+def _first_to_last_row_s(world: World) -> float:
+    """From the reading of the first row to that of the last: of all rows, less the time of one."""
+    camera = world.config.camera
+    return camera.readout_s * (camera.height_px - 1) / camera.height_px
 
 
 def ground_truth(world: World) -> dict[str, Any]:
@@ -160,7 +171,7 @@ def _joint_log(
 
 def _write_head_points(path: Path, world: World, truths: dict[str, SideTruth], generator: np.random.Generator) -> None:
     """Head points with the noise of a label, in frames where every camera sees them."""
-    uv = np.concatenate([truth.head_uv for truth in truths.values()], axis=-1)
+    uv = np.concatenate([truth.head_uv_read for truth in truths.values()], axis=-1)
     camera = world.config.camera
     limit = np.tile([camera.width_px - 1.0, camera.height_px - 1.0], len(truths))
     seen = ((uv >= 0.0) & (uv <= limit)).all(-1)

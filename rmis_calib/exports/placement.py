@@ -10,6 +10,7 @@ from rmis_calib.errors import InputError
 from rmis_calib.exports.hand_eye import in_metres, rigid_inverse
 from rmis_calib.geometry.cameras import StereoRig
 from rmis_calib.io import Recording
+from rmis_calib.io.recording import log_times_s
 from rmis_calib.kinematics import RobotKinematics
 from rmis_calib.results import CalibrationResult, KinematicOffsets
 from rmis_calib.robot import Robot
@@ -51,7 +52,7 @@ def placement(recording: Recording, result: CalibrationResult, frame: int | None
     offsets = result.kinematic_offsets
     arm, instrument = None if offsets.arm_is_instrument_base else recording.laparoscope_arm, recording.instrument_arm
     columns = () if arm is None else recording.robot.columns(arm)
-    times_s = recording.frame_times_s + recording.clock_offset_s + offsets.clock_s
+    times_s = log_times_s(recording.joint_times_s, recording.middle_s, *offsets.clock)
     readings, known = recording.joints.select(columns).at(times_s) if columns else (np.empty((len(times_s), 0)), None)
     usable = np.arange(len(times_s)) if known is None else np.flatnonzero(known)
     if frame is None and len(usable):

@@ -41,8 +41,8 @@ _MAX_SIGMA_IMAGE, _MAX_SIGMA_RAD = 0.05, 0.08
 _MAX_SETUP_RAD = 1.0
 """Of a set-up that is hardly known."""
 UNKNOWNS = ("unknown_names", "unknown_displacement", "unknown_at")
-CLOCK = "clock_s"
-"""Name of the clock offset among `unknown_names`."""
+CLOCK, CLOCK_RATE = CLOCKS = ("clock_s", "clock_rate")
+"""Names of the clock's offset and rate among `unknown_names`."""
 # A second of clock, a radian or a millimetre of a joint: none turns the shaft by more than a turn or moves it by 10 m.
 _MAX_TURN_RAD, _MAX_SHIFT_MM = 6.3, 1e4
 
@@ -227,8 +227,8 @@ def _unknowns(given: Arrays, n: int) -> Arrays:
         found = f"shape {names.shape}, dtype {names.dtype}"
         raise ObservationsError(where="unknown_names", expected="different names in one row", found=found)
     for name in names.tolist():
-        if name != CLOCK and not name.endswith(("_rad", "_mm")):
-            expected = f"{CLOCK}, or a joint's name that ends in its unit, _rad or _mm"
+        if name not in CLOCKS and not name.endswith(("_rad", "_mm")):
+            expected = f"{CLOCK}, {CLOCK_RATE}, or a joint's name that ends in its unit, _rad or _mm"
             raise ObservationsError(where="unknown_names", expected=expected, found=repr(name))
     out: Arrays = {"unknown_names": names.copy()}
     for name, shape in (("unknown_displacement", (n, len(names), 6)), ("unknown_at", (len(names),))):
@@ -237,9 +237,10 @@ def _unknowns(given: Arrays, n: int) -> Arrays:
             found = array.shape if array.shape != shape else "NaN"
             raise ObservationsError(where=name, expected=f"finite numbers of shape {shape}", found=found)
         out[name] = array
-    size = np.abs(out["unknown_displacement"])
-    if size[..., :3].max() > _MAX_TURN_RAD or size[..., 3:].max() > _MAX_SHIFT_MM:
-        found = f"{size[..., :3].max():.3g} and {size[..., 3:].max():.3g}"
+    size = np.abs(out["unknown_displacement"][:, names != CLOCK_RATE])  # the unit of a rate is the whole recording
+    turn, shift = (float(part.max(initial=0.0)) for part in (size[..., :3], size[..., 3:]))
+    if turn > _MAX_TURN_RAD or shift > _MAX_SHIFT_MM:
+        found = f"{turn:.3g} and {shift:.3g}"
         expected = f"at most {_MAX_TURN_RAD} rad and {_MAX_SHIFT_MM:g} mm a unit (rotation first)"
         raise ObservationsError(where="unknown_displacement", expected=expected, found=found)
     return out

@@ -46,6 +46,7 @@ class RecordingDescription:
     clock_offset_s: float
     head_points: HeadPoints | None
     notes: tuple[str, ...]
+    rolling_shutter_s: float
     inputs: tuple[Path, ...]
     """The folder, and every file that it names."""
 
@@ -84,7 +85,7 @@ def read_description(path: str | Path, clock_offset_s: float | None = None) -> R
     inputs = (folder, *(folder / name for name in named if name is not None and (folder / name).exists()))
     return RecordingDescription(
         folder, robot, stereo, right, left, joints, frame_times_s, schema.laparoscope_arm, schema.instrument_arm,
-        schema.shaft_diameter_mm, float(offset), heads, tuple(notes), inputs,
+        schema.shaft_diameter_mm, float(offset), heads, tuple(notes), schema.rolling_shutter_s, inputs,
     )  # fmt: skip
 
 

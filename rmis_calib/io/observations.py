@@ -69,7 +69,8 @@ class ShaftObservations:
     """(N, 3), mm."""
     unknown_names: np.ndarray | None = None
     """(U,) names of constant offsets of the kinematics that can be estimated: a joint's column (`<arm>.<joint>_rad` or
-    `_mm`) or `clock_s`, in that unit. The three arrays come together."""
+    `_mm`) or `clock_s`, in that unit; `clock_rate`: by how much the joints' clock runs faster than the video's. The
+    three arrays come together."""
     unknown_displacement: np.ndarray | None = None
     """(N, U, 6): how a unit of each offset displaces the shaft as a rigid body, in `rcm`: rotation vector, rad, then
     translation, mm. A change dv of `rcm_v_axis` counts as the rotation v x dv, a change ds of `rcm_s_end_mm` as the
@@ -192,8 +193,8 @@ class ShaftObservations:
 
 _LARGEST_BYTES = 4 << 30
 """Of all arrays of a file: six million motions of everything that can be measured."""
-CLOCK = checks.CLOCK
-"""Name of the clock offset among `unknown_names`."""
+CLOCK, CLOCK_RATE = CLOCKS = checks.CLOCKS
+"""Names of the clock's offset and rate among `unknown_names`."""
 OBSERVATION_KEYS: tuple[str, ...] = tuple(field.name for field in fields(ShaftObservations))
 
 

@@ -41,11 +41,24 @@ class Recording:
     head_points: HeadPoints | None
     notes: tuple[str, ...] = ()
     """What was guessed or mended while the files were read, a sentence each."""
+    rolling_shutter_s: float = 0.0
+    """Time from reading the first row of a picture, which is the frame's time, to reading the last."""
 
     @property
     def n_frames(self) -> int:
         """Number of frames of each camera."""
         return len(self.frame_times_s)
+
+    @property
+    def joint_times_s(self) -> Float[np.ndarray, " n"]:
+        """When the middle row of each frame was read, on the clock of the joint log as far as the recording tells."""
+        return self.frame_times_s + self.clock_offset_s + 0.5 * self.rolling_shutter_s
+
+    @property
+    def middle_s(self) -> float:
+        """Middle of `joint_times_s`: where the rate of a clock does nothing."""
+        times_s = self.joint_times_s
+        return 0.5 * float(times_s[0] + times_s[-1]) if len(times_s) else 0.0
 
     def joints_at_frames(self, arm: str | None) -> tuple[Float[np.ndarray, "n j"], Bool[np.ndarray, " n"]]:
         """Readings of an arm at each frame, rad and mm in the order of its joints, and where the log knows them.
@@ -59,7 +72,21 @@ class Recording:
         """
         if arm is None:
             return np.empty((self.n_frames, 0)), np.ones(self.n_frames, dtype=bool)
-        return self.joints.select(self.robot.columns(arm)).at(self.frame_times_s + self.clock_offset_s)
+        return self.joints.select(self.robot.columns(arm)).at(self.joint_times_s)
+
+
+def log_times_s(
+    joint_times_s: Float[np.ndarray, "*n"], middle_s: float, offset_s: float | np.ndarray, rate: float | np.ndarray
+) -> Float[np.ndarray, "*m"]:
+    """Times on the clock of the joint log, with what a calibration found to be off in it.
+
+    Args:
+        joint_times_s: as the recording tells (`Recording.joint_times_s`).
+        middle_s: `Recording.middle_s`.
+        offset_s: added everywhere.
+        rate: added a second from the middle of the recording.
+    """
+    return joint_times_s + offset_s + rate * (joint_times_s - middle_s)
 
 
 def load_recording(path: str | Path | RecordingDescription, clock_offset_s: float | None = None) -> Recording:
@@ -80,6 +107,7 @@ def load_recording(path: str | Path | RecordingDescription, clock_offset_s: floa
         read.path, read.robot, camera_rig(read.stereo), FrameSource(read.right),
         None if read.left is None else FrameSource(read.left), read.joints, read.frame_times_s, read.laparoscope_arm,
         read.instrument_arm, read.shaft_diameter_mm, read.clock_offset_s, read.head_points, read.notes,
+        read.rolling_shutter_s,
     )  # fmt: skip
 
 

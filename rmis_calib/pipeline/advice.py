@@ -206,8 +206,8 @@ def joint_candidates(
         settings: how far joints may go.
         seed: of the random ones.
     """
-    joint_offset, clock_s = estimated_offsets(solution, unknowns.columns, problem.arm_T_rcm)
-    logged = unknowns.readings_of_motions(clock_s).cpu().numpy()
+    joint_offset, clock = estimated_offsets(solution, unknowns.columns, problem.arm_T_rcm)
+    logged = unknowns.readings_of_motions(clock).cpu().numpy()
     low, high = joint_box(recording, unknowns.columns, logged, settings)
     home = logged[np.flatnonzero(used)[-1] if used.any() else -1]
     free = np.flatnonzero(unknowns.moves_shaft().cpu().numpy())

@@ -27,6 +27,7 @@ from rmis_calib.pipeline.offset_unknowns import estimated_offsets
 from rmis_calib.pipeline.offsets import estimate_with_kinematics
 from rmis_calib.pipeline.poses import MotionPoses, frame_of, motion_poses
 from rmis_calib.pipeline.result import insufficient_data, make_result, motions_of, residual_of, residuals_px
+from rmis_calib.pipeline.rolling_shutter import with_rows_at_one_instant
 from rmis_calib.pipeline.run import CalibrationRun
 from rmis_calib.results import CalibrationResult
 from rmis_calib.solver.problem import stands_still
@@ -107,10 +108,11 @@ def calibrate_views(
     draft = _without_joint_offsets(config)
     run = solve_choices(recording, draft, views, poses, attempts, progress)
     run = _choose_again(run, draft, several, progress)
+    run, about_rows = _with_rows_at_one_instant(run, draft, progress)
     run = _with_joint_offsets(run, config, progress)
     progress("checking", 0, 1)
     run = with_misfit_named(run, config, lambda: _with_cameras_as_given(run, config))
-    run = run.with_notes((*recording.notes, *notes))
+    run = run.with_notes((*recording.notes, *notes, *about_rows))
     run = with_next_motions(run, config)
     progress("checking", 1, 1)
     return run
@@ -203,6 +205,18 @@ def _better_choices(run: CalibrationRun, several: bool) -> tuple[Choice, ...] | 
     return tuple(better)
 
 
+def _with_rows_at_one_instant(
+    run: CalibrationRun, config: CalibrationConfig, progress: Progress
+) -> tuple[CalibrationRun, tuple[str, ...]]:
+    """The same choice solved with the rows of each picture put to one instant, and a note on it."""
+
+    def solve_again(views: tuple[View, ...]) -> CalibrationRun:
+        return _solve_again(replace(run, views=views), config, run.choices, progress)
+
+    run, note = with_rows_at_one_instant(run, solve_again)
+    return run, (note,) if note else ()
+
+
 def _with_joint_offsets(run: CalibrationRun, config: CalibrationConfig, progress: Progress) -> CalibrationRun:
     """The same choice solved as configured, where the attempts before left the joint offsets out."""
     if _without_joint_offsets(config) == config:
@@ -221,7 +235,7 @@ def _solve_again(
     run: CalibrationRun, config: CalibrationConfig, choices: tuple[Choice, ...], progress: Progress
 ) -> CalibrationRun:
     """The same recording solved with other choices or settings, at the clock that was found."""
-    return _solve(run.recording, config, run.views, run.told, choices, progress, run.clock_s)
+    return _solve(run.recording, config, run.views, run.told, choices, progress, run.clock)
 
 
 def _solve(
@@ -231,9 +245,9 @@ def _solve(
     told: MotionPoses,
     choices: tuple[Choice, ...],
     progress: Progress,
-    clock_s: float | None = None,
+    clock: tuple[float, float] | None = None,
 ) -> CalibrationRun:
-    """Assemble the chosen candidates, solve, and say what came out; `clock_s` saves the search for the clock.
+    """Assemble the chosen candidates, solve, and say what came out; `clock` saves the search for it.
 
     Every solve sets out from the kinematics as the recording tells them: a run's poses are at what it found, which must
     not be taken for what is stated.
@@ -254,7 +268,7 @@ def _solve(
         if unknowns is None:
             solution, notes = estimate(observations, config), ()
         else:
-            solution, notes = estimate_with_kinematics(observations, config, unknowns, clock_s)
+            solution, notes = estimate_with_kinematics(observations, config, unknowns, clock)
             offsets = estimated_offsets(solution, unknowns.columns, poses.rcm_s_end_mm)
             poses, known = unknowns.motion_poses(poses.frames, *offsets)
             observations = assemble(recording, poses, views, tuple(c.where(known) for c in choices), config)

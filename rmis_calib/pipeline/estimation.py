@@ -114,9 +114,9 @@ def _advised(
         return observability
     problem = problem_of(observations, config).flatten_batch()
     if unknowns is not None:
-        joint_offset, clock_s = estimated_offsets(solution, unknowns.columns, problem.radius_mm)
-        clock = problem.radius_mm.new_tensor([clock_s])
-        problem = unknowns.linearised(problem, joint_offset[None], clock, torch.zeros_like(joint_offset))
+        joint_offset, clock = estimated_offsets(solution, unknowns.columns, problem.radius_mm)
+        at_clock = problem.radius_mm.new_tensor([clock])
+        problem = unknowns.linearised(problem, joint_offset[None], at_clock, torch.zeros_like(joint_offset))
     last = int(np.flatnonzero(motions.used)[-1])
     candidates = pose_candidates(problem, solution, last, config.solver.advice)
     return with_advice(observability, solution, candidates, seen_view(problem), config, WHERE)

@@ -7,16 +7,19 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from rmis_calib.errors import InputError
+from rmis_calib.geometry.cameras import Camera
 from rmis_calib.geometry.rigid import RigidTransform, rigid_inverse, transform_points
 from rmis_calib.geometry.rotations import matrix_to_rotvec
 from rmis_calib.io import Recording, load_recording, load_yaml
 from rmis_calib.io._checks import no_note, rigid_from_text
 from rmis_calib.io.configs import load_json
-from rmis_calib.pipeline.found_offsets import poses_at
-from rmis_calib.pipeline.poses import MotionPoses
-from rmis_calib.results import CalibrationResult, HeadPointError
+from rmis_calib.pipeline.found_offsets import poses_at, poses_at_motions
+from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
+from rmis_calib.pipeline.poses import MotionPoses, row_delay_s
+from rmis_calib.results import CalibrationResult, HeadPointError, KinematicOffsets
 
 
 @dataclass(frozen=True)
@@ -113,6 +116,13 @@ def head_point_errors(
 ) -> dict[str, np.ndarray] | None:
     """Distance in px of each labelled head point from where the result puts it, (N,) per camera, NaN where unlabelled.
 
+    Each point is predicted at the instant at which its row was read.
+
+    Args:
+        result: with a transform.
+        recording: with the labels.
+        poses: of the motions, with what the calibration found to be off (clock, joints, RCM, set-up).
+
     Source: paper, "Experimental results": the known point on the instrument, seen through kinematics and calibration.
     """
     points = recording.head_points
@@ -122,14 +132,35 @@ def head_point_errors(
     views = {"right": (recording.stereo.right, result.camera_right_T_arm, points.uv_right)}
     if points.uv_left is not None and result.camera_left_T_arm is not None and recording.stereo.left is not None:
         views["left"] = (recording.stereo.left, result.camera_left_T_arm, points.uv_left)
-    arm_p_head = transform_points(poses.arm_T_rcm.cpu(), poses.rcm_p_head.cpu())
+    ends = _poses_at_first_and_last_row(recording, result.kinematic_offsets, poses)
     for name, (camera, camera_T_arm, uv) in views.items():
         predicted = np.full((recording.n_frames, 2), np.nan)
         camera = camera.corrected(*result.intrinsic_correction(name))
-        predicted[poses.frames] = camera.project(camera_T_arm.apply(arm_p_head))[0].numpy()
+
+        def seen(at: MotionPoses, camera: Camera = camera, camera_T_arm: RigidTransform = camera_T_arm) -> Tensor:
+            arm_p_head = transform_points(at.arm_T_rcm.cpu(), at.rcm_p_head.cpu())
+            return camera.project(camera_T_arm.apply(arm_p_head))[0]
+
+        uv_px = seen(poses)
+        if ends:
+            travel = seen(ends[1]) - seen(ends[0])
+            uv_px = uv_px + row_delay_s(camera, uv_px[:, 1], 1.0)[:, None] * travel
+        predicted[poses.frames] = uv_px.numpy()
         errors[name] = np.full(recording.n_frames, np.nan)
         errors[name][points.frames] = np.linalg.norm(predicted[points.frames] - uv, axis=-1)
     return errors
+
+
+def _poses_at_first_and_last_row(
+    recording: Recording, offsets: KinematicOffsets, poses: MotionPoses
+) -> list[MotionPoses]:
+    """Poses of the motions when the first and when the last row of each picture is read; none where all are read
+    together, or the joints' velocity is not known."""
+    half_s = 0.5 * recording.rolling_shutter_s
+    if not half_s:
+        return []
+    unknowns = KinematicUnknowns(recording, poses.frames, str(poses.arm_T_rcm.device))
+    return [poses_at_motions(unknowns, poses, offsets, s) for s in (-half_s, half_s)] if unknowns.has_clock else []
 
 
 def summarise_head_points(errors: dict[str, np.ndarray] | None) -> dict[str, HeadPointError] | None:

@@ -18,11 +18,11 @@ def poses_at(recording: Recording, offsets: KinematicOffsets, device: str = "cpu
     Motions whose time the joint log does not cover at that clock are left out.
     """
     poses = motion_poses(recording, device)
-    if offsets.clock_s or any(offsets.joints.values()):
+    if any(offsets.clock) or any(offsets.joints.values()):
         unknowns = KinematicUnknowns(recording, poses.frames, device)
         values = [offsets.joints.get(column, 0.0) for column in unknowns.columns]
         joint_offset = torch.tensor(values, dtype=torch.float64, device=device)
-        poses, known = unknowns.motion_poses(poses.frames, joint_offset, offsets.clock_s)
+        poses, known = unknowns.motion_poses(poses.frames, joint_offset, offsets.clock)
         poses = poses.select(known)
     return with_rcm_offset(with_setup(poses, offsets), offsets.rcm_mm)
 
@@ -33,7 +33,8 @@ def poses_at_motions(
     """Poses of these motions with the offsets that were found, some time later."""
     values = [offsets.joints.get(column, 0.0) for column in unknowns.columns]
     joint_offset = torch.tensor(values, dtype=torch.float64, device=poses.arm_T_rcm.device)
-    at, _ = unknowns.motion_poses(poses.frames, joint_offset, offsets.clock_s + later_s)
+    offset_s, rate = offsets.clock
+    at, _ = unknowns.motion_poses(poses.frames, joint_offset, (offset_s + later_s, rate))
     return with_rcm_offset(with_setup(at, offsets), offsets.rcm_mm)
 
 

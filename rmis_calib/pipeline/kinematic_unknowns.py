@@ -1,5 +1,6 @@
 """The effect of joint offsets and the clock, as the joint log and both arms' kinematics tell it."""
 
+from copy import copy
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -10,8 +11,9 @@ from torch import Tensor
 
 from rmis_calib.geometry.rigid import rigid_inverse
 from rmis_calib.io import Recording
+from rmis_calib.io.recording import log_times_s
 from rmis_calib.kinematics import RobotKinematics
-from rmis_calib.pipeline.offset_unknowns import OffsetUnknowns
+from rmis_calib.pipeline.offset_unknowns import NO_CLOCK, OffsetUnknowns
 from rmis_calib.pipeline.poses import MotionPoses, poses_of
 from rmis_calib.solver import Problem
 from rmis_calib.solver.settings import SolverSettings
@@ -49,22 +51,29 @@ class KinematicUnknowns(OffsetUnknowns):
         arms = [arm for arm in (recording.laparoscope_arm, recording.instrument_arm) if arm is not None]
         self.columns = tuple(recording.robot.joints(*arms))
         self._log = recording.joints.select(self.columns)
-        self._times = recording.frame_times_s[frames] + recording.clock_offset_s
+        self._times, self._middle_s = recording.joint_times_s[frames], recording.middle_s
+        self.motions, self.half_s = len(frames), float(np.abs(self._times - self._middle_s).max(initial=0.0))
         intervals_s = np.diff(self._log.timestamps_s)
         # In a log of poses there is no velocity.
         self.has_clock = len(intervals_s) > 0 and float(np.median(intervals_s)) <= _CONTINUOUS_LOG_S
-        self.clock_at_s = None
+        self.clock_at = None
         self._device = device
         self.laparoscope_joints = len(self._kinematics.laparoscope_joints)
 
-    def readings_of_motions(self, clock_s: float) -> Float[Tensor, "m j"]:
-        """Logged readings of every motion, rad or mm."""
-        return self._readings(torch.tensor([clock_s], dtype=torch.float64))[0][0]
+    def every(self, step: int) -> "KinematicUnknowns":
+        few = copy(self)
+        few._times = self._times[::step]
+        few.motions = len(few._times)
+        return few
 
-    def at(self, base: Problem, joint_offset: Float[Tensor, "b j"], clock_s: Float[Tensor, " b"]) -> Problem:
-        readings, known = self._readings(clock_s)
+    def readings_of_motions(self, clock: tuple[float, float] = NO_CLOCK) -> Float[Tensor, "m j"]:
+        """Logged readings of every motion, rad or mm."""
+        return self._readings(torch.tensor([clock], dtype=torch.float64))[0][0]
+
+    def at(self, base: Problem, joint_offset: Float[Tensor, "b j"], clock: Float[Tensor, "b 2"]) -> Problem:
+        readings, known = self._readings(clock)
         at = self._poses(readings + joint_offset[:, None])
-        repeated = base.take_trials(torch.zeros(len(clock_s), dtype=torch.int64, device=joint_offset.device))
+        repeated = base.take_trials(torch.zeros(len(clock), dtype=torch.int64, device=joint_offset.device))
         return replace(
             repeated,
             arm_T_rcm=at.arm_T_rcm,
@@ -74,19 +83,21 @@ class KinematicUnknowns(OffsetUnknowns):
             laparoscope_base_T_arm=None if repeated.laparoscope_base_T_arm is None else at.laparoscope_base_T_arm,
             valid=repeated.valid & known[:, None],
             joint_offset_at=joint_offset,
-            clock_at=clock_s,
+            clock_at=clock,
         )
 
     def joint_derivative(
-        self, joint_offset: Float[Tensor, "b j"], clock_s: Float[Tensor, " b"]
+        self, joint_offset: Float[Tensor, "b j"], clock: Float[Tensor, "b 2"]
     ) -> Float[Tensor, "b m 6 j"]:
-        return self._jacobian(self._readings(clock_s)[0] + joint_offset.to(self._device)[:, None])
+        return self._jacobian(self._readings(clock)[0] + joint_offset.to(self._device)[:, None])
 
     def clock_derivative(
-        self, joint_derivative: Float[Tensor, "b m 6 j"], clock_s: Float[Tensor, " b"]
-    ) -> Float[Tensor, "b m 6"]:
-        velocity = torch.as_tensor(self._log.interpolate(self._times_at(clock_s))[1], device=self._device)
-        return (joint_derivative @ velocity[..., None])[..., 0]  # velocity: (b, m, j), unit per second
+        self, joint_derivative: Float[Tensor, "b m 6 j"], clock: Float[Tensor, "b 2"]
+    ) -> Float[Tensor, "b m 6 2"]:
+        velocity = torch.as_tensor(self._log.interpolate(self._times_at(clock))[1], device=self._device)
+        by_offset = joint_derivative @ velocity[..., None]  # velocity: (b, m, j), unit per second
+        from_middle = torch.as_tensor(self._times - self._middle_s, device=self._device)
+        return torch.cat((by_offset, by_offset * from_middle[:, None, None]), dim=-1)
 
     def resting_at(self, base: Problem, readings: Float[Tensor, "m j"], joint_offset: Float[Tensor, " j"]) -> Problem:
         """The motions of `base` (one trial) with the arms at rest at these readings; rad or mm, offsets to be added."""
@@ -103,16 +114,16 @@ class KinematicUnknowns(OffsetUnknowns):
             laparoscope_base_T_instrument_base=stated[None] if told and stated is not None else None,
             joint_derivative=derivative,
             laparoscope_joints=self.laparoscope_joints,
-            clock_derivative=torch.zeros_like(derivative[..., 0]),
+            clock_derivative=torch.zeros_like(derivative[..., :1]).repeat(1, 1, 1, 2),
         )
         setup = base.laparoscope_base_T_instrument_base
         return resting if setup is None else resting.at_setup(setup)
 
     def motion_poses(
-        self, frames: np.ndarray, joint_offset: Float[Tensor, " j"], clock_s: float
+        self, frames: np.ndarray, joint_offset: Float[Tensor, " j"], clock: tuple[float, float] = NO_CLOCK
     ) -> tuple[MotionPoses, Bool[Tensor, " m"]]:
         """Poses of the motions at one set of offsets, and in which motions the log covers that time."""
-        readings, known = self._readings(torch.tensor([clock_s], dtype=torch.float64))
+        readings, known = self._readings(torch.tensor([clock], dtype=torch.float64))
         laparoscope, instrument = (readings[0] + joint_offset).tensor_split((self.laparoscope_joints,), dim=-1)
         return poses_of(self._kinematics, frames, laparoscope, instrument), known[0]
 
@@ -127,16 +138,17 @@ class KinematicUnknowns(OffsetUnknowns):
         own = torch.eye(4).to(arm_T_rcm).expand_as(arm_T_rcm) if own is None else own
         return _Poses(arm_T_rcm, pose.rcm_v_axis, pose.rcm_s_end_mm, pose.rcm_p_head, own)
 
-    def _readings(self, clock_s: Float[Tensor, " b"]) -> tuple[Float[Tensor, "b m j"], Tensor]:
+    def _readings(self, clock: Float[Tensor, "b 2"]) -> tuple[Float[Tensor, "b m j"], Tensor]:
         """Readings at the frames' times, and where the log knows them; the nearest known time elsewhere."""
-        times = self._times_at(clock_s)
+        times = self._times_at(clock)
         _, known = self._log.at(times.ravel())
         readings, _ = self._log.interpolate(times)
         known = known.reshape(times.shape)
         return torch.as_tensor(readings, device=self._device), torch.as_tensor(known, device=self._device)
 
-    def _times_at(self, clock_s: Float[Tensor, " b"]) -> np.ndarray:
-        return self._times + clock_s.cpu().numpy()[:, None]
+    def _times_at(self, clock: Float[Tensor, "b 2"]) -> np.ndarray:
+        offset_s, rate = clock.cpu().numpy().T[..., None]
+        return log_times_s(self._times, self._middle_s, offset_s, rate)
 
     def _jacobian(self, readings: Float[Tensor, "b m j"]) -> Float[Tensor, "b m 6 j"]:
         """Displacement of the shaft as a rigid body, in `rcm`, per unit of each joint."""

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rmis_calib.errors import RobotError
+from rmis_calib.geometry.cameras import Camera
 from rmis_calib.geometry.lines import contour_planes
 from rmis_calib.geometry.rigid import rigid_inverse, rotate_vectors, transform_points
 from rmis_calib.io import Recording
@@ -149,3 +150,9 @@ def predict_ends(camera_T_arm: Float[Tensor, "4 4"], poses: MotionPoses, offset_
     """The shaft's end on the axis, in one camera, mm."""
     rcm_p_end = poses.rcm_v_axis * (poses.rcm_s_end_mm + offset_mm)[:, None]
     return transform_points(camera_T_arm @ poses.arm_T_rcm, rcm_p_end)
+
+
+def row_delay_s(camera: Camera, v_px: Float[Tensor, "*b"], rolling_shutter_s: float) -> Float[Tensor, "*b"]:
+    """How long after the middle row of the picture the row of each pixel is read, s; 0 where it is NaN."""
+    last = max(camera.image_size[0] - 1, 1)
+    return rolling_shutter_s * torch.nan_to_num(v_px / last - 0.5).clamp(-0.5, 0.5)

@@ -195,7 +195,7 @@ def _expected(run: CalibrationRun, config: CalibrationConfig) -> tuple[Finding, 
     spread = np.unique(np.linspace(0, len(all_poses.frames) - 1, _PREDICTED_MOTIONS).astype(int))
     unknowns = KinematicUnknowns(recording, all_poses.frames[spread], config.device)
     problem = at_found_setup(problem_of(run.observations, config).flatten_batch(), solution)
-    readings = unknowns.readings_of_motions(0.0)
+    readings = unknowns.readings_of_motions()
     at = unknowns.resting_at(measured_alike(problem, len(spread)), readings, torch.zeros_like(readings[0]))
     cameras = [camera for camera in (recording.stereo.right, recording.stereo.left) if camera is not None]
     view = torch.stack([camera_view(camera) for camera in cameras[: problem.n_cameras]]).to(config.device)

@@ -43,10 +43,10 @@ class CalibrationRun:
         return replace(self, result=replace(self.result, notes=notes + self.result.notes))
 
     @property
-    def clock_s(self) -> float | None:
-        """Clock offset that was found; None where it is no unknown or the data cannot tell it."""
+    def clock(self) -> tuple[float, float] | None:
+        """Clock that was found, offset (s) and rate; None where it is no unknown or the data cannot tell it."""
         clock = None if self.solution is None else self.solution.nuisances.get("clock")
-        return None if clock is None or bool(clock.held) else float(clock.value)
+        return None if clock is None or bool(clock.held) else self.result.kinematic_offsets.clock
 
     def camera(self, view: View) -> Camera | None:
         """A view's camera, corrected by what was found to be off in it."""

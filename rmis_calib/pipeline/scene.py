@@ -11,6 +11,7 @@ from torch import Tensor
 from rmis_calib.errors import InputError
 from rmis_calib.geometry.rigid import rigid_inverse, transform_points
 from rmis_calib.io import Recording
+from rmis_calib.io.recording import log_times_s
 from rmis_calib.kinematics import RobotKinematics
 from rmis_calib.pipeline.found_offsets import with_found_bases
 from rmis_calib.pipeline.poses import check_apart
@@ -74,7 +75,7 @@ def scene_of(recording: Recording, result: CalibrationResult | None = None) -> S
         RobotError: the robot's description cannot carry the recording's arms.
     """
     offsets = _NO_OFFSETS if result is None else result.kinematic_offsets
-    columns, frames, readings = _readings(recording, offsets.clock_s)
+    columns, frames, readings = _readings(recording, offsets.clock)
     return _scene(recording, frames, readings, columns, result)
 
 
@@ -83,7 +84,7 @@ def advised_scene(recording: Recording, result: CalibrationResult) -> Scene | No
     advice = result.observability.next_motions
     if not advice or advice[0].joints is None:
         return None
-    columns, frames, readings = _readings(recording, result.kinematic_offsets.clock_s)
+    columns, frames, readings = _readings(recording, result.kinematic_offsets.clock)
     readings = readings[-1:].clone()
     for index, column in enumerate(columns):
         readings[:, index] = advice[0].joints.get(column, float(readings[0, index]))
@@ -131,13 +132,16 @@ def point_covariance(
     return J @ covariance @ J.T
 
 
-def _readings(recording: Recording, clock_s: float) -> tuple[tuple[str, ...], np.ndarray, Float[Tensor, "m j"]]:
+def _readings(
+    recording: Recording, clock: tuple[float, float]
+) -> tuple[tuple[str, ...], np.ndarray, Float[Tensor, "m j"]]:
     """Columns of the joint log that move the arms, the frames at whose times it is known, and their readings."""
     arms = [arm for arm in (recording.laparoscope_arm, recording.instrument_arm) if arm is not None]
     columns = tuple(recording.robot.joints(*arms))
-    log, times_s = recording.joints.select(columns), recording.frame_times_s + recording.clock_offset_s
-    frames = np.flatnonzero(log.at(times_s)[1] & log.at(times_s + clock_s)[1])
-    return columns, frames, torch.as_tensor(log.interpolate(times_s[frames] + clock_s)[0])
+    log, times_s = recording.joints.select(columns), recording.joint_times_s
+    at_s = log_times_s(times_s, recording.middle_s, *clock)
+    frames = np.flatnonzero(log.at(times_s)[1] & log.at(at_s)[1])
+    return columns, frames, torch.as_tensor(log.interpolate(at_s[frames])[0])
 
 
 def _scene(

@@ -195,5 +195,12 @@ class KinematicOffsets:
     """Of the shaft's axis from the nominal RCM, along two directions across it that are fixed to `rcm`."""
     setup: Transform | None = None
     """`laparoscope_base_T_instrument_base`, mm; None where it was not estimated."""
+    clock_rate: float = 0.0
+    """Added to these times a second from the middle of the recording."""
     arm_is_instrument_base: bool = False
     """Whether the instrument's base takes the place of `arm`."""
+
+    @property
+    def clock(self) -> tuple[float, float]:
+        """Offset, s, and rate of the clock."""
+        return self.clock_s, self.clock_rate

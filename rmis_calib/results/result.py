@@ -149,7 +149,8 @@ class CalibrationResult:
         setup = None if self.setup is None else self.setup.laparoscope_base_T_instrument_base
         found = self.camera_right_T_arm
         in_base = found is not None and found.src == INSTRUMENT_BASE
-        return KinematicOffsets(joints, self.nuisance("clock"), rcm_mm, setup, in_base)
+        clock_rate = self.nuisance("clock_rate")
+        return KinematicOffsets(joints, self.nuisance("clock"), rcm_mm, setup, clock_rate, in_base)
 
     def nuisance(self, name: str, otherwise: float = 0.0) -> float:
         """Value of a nuisance in its unit; `otherwise` where it was not estimated."""

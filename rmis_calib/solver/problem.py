@@ -89,10 +89,11 @@ class Problem:
             each joint's offset, [motion, 6, joint]; None when joint offsets cannot be estimated. A change of
             `rcm_v_axis` enters as v x dv, a change of the insertion as v ds.
         joint_offset_sigma: prior of each joint's offset, in its unit.
-        clock_derivative: the same displacement per second of clock offset, [motion, 6].
+        clock_derivative: the same displacement per second of clock offset, and per unit by which the joints' clock runs
+            faster than the video's (which is that times the time from the recording's middle), [motion, 6, 2].
         laparoscope_joints: how many of the joints, the first ones, are the laparoscope's.
         joint_offset_at: joint offsets at which the kinematics here were evaluated; None: zero.
-        clock_at: clock offset, s, likewise.
+        clock_at: clock offset, s, and rate, likewise.
         own: measurements of the user's own.
         laparoscope_base_T_arm: forward kinematics of the laparoscope's arm in its own base; None where the set-up
             (the pose of one arm's base in the other's) cannot be an unknown.
@@ -118,9 +119,9 @@ class Problem:
     noise: NoiseLevels
     joint_derivative: Float[Tensor, "*batch n 6 j"] | None = None
     joint_offset_sigma: Float[Tensor, "*batch j"] | None = None
-    clock_derivative: Float[Tensor, "*batch n 6"] | None = None
+    clock_derivative: Float[Tensor, "*batch n 6 2"] | None = None
     joint_offset_at: Float[Tensor, "*batch j"] | None = None
-    clock_at: Float[Tensor, "*batch"] | None = None
+    clock_at: Float[Tensor, "*batch 2"] | None = None
     own: tuple[Measurement, ...] = ()
     laparoscope_base_T_arm: Float[Tensor, "*batch n 4 4"] | None = None
     laparoscope_base_T_instrument_base: Float[Tensor, "*batch 4 4"] | None = None

@@ -67,6 +67,11 @@ class UnknownSettings:
     clock_sigma_s: NotNegative = 2.0
     """Prior of the clock offset about zero. Public recordings are off by up to 2.4 s; data that see the clock at all
     see it to milliseconds."""
+    clock_rate: Literal["never", "auto", "always"] = "auto"
+    """Estimate by how much the clock of the joints runs faster than that of the video (a frame rate that is written
+    wrong), beside the offset; `auto`: where the data ask for it."""
+    clock_rate_sigma: NotNegative = 0.02
+    """Prior of that rate about zero: 29.97 for 30 frames a second is 0.001, 24 for 25 is 0.04."""
     edge_bias: bool = True
     """Estimate the shift across its line that each line point has in every motion alike (an error of the lens model or
     of the edge detector does not average out), where the observations name its prior (`sigma_edge_bias`)."""

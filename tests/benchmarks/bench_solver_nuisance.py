@@ -38,8 +38,8 @@ class Recorded:
         times_s: (n,) of the frames.
         arrays: what the cameras measured, trials first.
         noise: (trials, n, 4, 4) noise of arm_T_rcm.
-        offset: (6,) true minus read, laparoscope's joints first; clock_s: frame time + clock_s is the time in the
-            joint log.
+        offset: (6,) true minus read, laparoscope's joints first.
+        clock_s, rate: the time in the joint log is that of the frame + clock_s + rate times that from the middle.
     """
 
     scene: Scene
@@ -48,6 +48,7 @@ class Recorded:
     noise: np.ndarray
     offset: np.ndarray
     clock_s: float
+    rate: float = 0.0
 
     def joints(self, times_s: np.ndarray) -> np.ndarray:
         """True joint values (..., 6) of the smooth path, amplitude 5 degrees and 10 mm."""
@@ -67,11 +68,13 @@ class Recorded:
     def poses(self, q: np.ndarray):
         return poses_at(self.scene, q[..., :3], q[..., 3:])
 
-    def kinematics(self, joint_offset: torch.Tensor, clock_s: torch.Tensor) -> Problem:
+    def kinematics(self, joint_offset: torch.Tensor, clock: torch.Tensor, setup: torch.Tensor | None = None) -> Problem:
         """What a pipeline hands to the solver: both arms at these offsets, with derivatives by central differences."""
         trials = self.noise.shape[0]
         b = joint_offset.shape[0]
-        at = self.times_s + clock_s.numpy()[:, None] - self.clock_s
+        offset_s, rate = (clock.numpy() - np.array([self.clock_s, self.rate])).T[..., None]
+        from_middle = self.times_s - 0.5 * (self.times_s[0] + self.times_s[-1])
+        at = self.times_s + offset_s + rate * from_middle
         q = self.joints(at) - self.offset + joint_offset.numpy()[:, None]
         centre = self.poses(q)
         derivative = [
@@ -79,7 +82,8 @@ class Recorded:
             for j, step in enumerate([1e-5, 1e-5, 1e-3] * 2)
         ]
         later, earlier = self.joints(at + 1e-4) - self.joints(at), self.joints(at - 1e-4) - self.joints(at)
-        clock = self._displacement(centre, q, 0.5 * (later - earlier), 2e-4)
+        by_offset = self._displacement(centre, q, 0.5 * (later - earlier), 2e-4)
+        clock_derivative = np.stack((by_offset, by_offset * from_middle[:, None]), -1)
         arrays = {
             k: np.broadcast_to(v[:1], (b, *v.shape[1:]))
             if b != trials and isinstance(v, np.ndarray) and v.ndim > 1
@@ -101,7 +105,7 @@ class Recorded:
             problem,
             joint_derivative=torch.as_tensor(np.stack(derivative, -1)), joint_offset_sigma=sigma.expand(b, 6),
             joint_offset_at=joint_offset,
-            clock_derivative=torch.as_tensor(clock), clock_at=clock_s,
+            clock_derivative=torch.as_tensor(clock_derivative), clock_at=clock,
         )  # fmt: skip
 
     def _displacement(self, centre, q, step, length):
@@ -120,7 +124,7 @@ class Recorded:
 
 
 def record(
-    trials: int, n: int, seed: int, offset=None, clock_s: float = 0.0, stereo=(0.0, 0.0)
+    trials: int, n: int, seed: int, offset=None, clock_s: float = 0.0, stereo=(0.0, 0.0), rate: float = 0.0
 ) -> tuple[Recorded, torch.Tensor]:
     """A recording and its true transform."""
     settings: LineStudyConfig = config(REALISTIC, trials, seed)
@@ -133,6 +137,7 @@ def record(
         np.zeros(0),
         np.zeros(6) if offset is None else np.asarray(offset),
         clock_s,
+        rate,
     )
     poses = empty.poses(np.broadcast_to(empty.joints(empty.times_s), (trials, n, 6)))
     right = scene.camera_right_T_arm @ poses.arm_T_rcm
@@ -200,7 +205,7 @@ def main() -> int:
     print(f"{t} trials of {n} motions, 0.3 px, 0.3 mm, 0.1 deg; contours and ends, stereo\n")
     print(f"{'':34} | ignored: deg, mm (sigma)    | estimated: deg, mm (sigma)  | first trial: value +- sigma")
     known = UnknownSettings(radius_sigma_relative=0.0, stereo=False, joint_offsets="never")
-    zero_j, zero_c = torch.zeros(t, 6, dtype=torch.float64), torch.zeros(t, dtype=torch.float64)
+    zero_j, zero_c = torch.zeros(t, 6, dtype=torch.float64), torch.zeros(t, 2, dtype=torch.float64)
 
     def restricted(recorded):
         return lambda joints, clock: recorded.kinematics(joints, clock).only("contours", "ends")
@@ -226,11 +231,12 @@ def main() -> int:
     for clock in (0.04, 2.4):
         recorded, truth = record(t, n, 1, clock_s=clock)
         kinematics = restricted(recorded)
-        candidates = torch.arange(-4.0, 4.01, 0.1, dtype=torch.float64)
+        offsets = torch.arange(-4.0, 4.01, 0.1, dtype=torch.float64)
+        candidates = torch.stack((offsets, torch.zeros_like(offsets)), dim=-1)
         found, _ = scan_clock(recorded.kinematics, 6, candidates)
         start = kinematics(zero_j, zero_c + found)
         row(
-            f"clock {clock} s (scan finds {found:+.1f})",
+            f"clock {clock} s (scan finds {float(found[0]):+.1f})",
             kinematics(zero_j, zero_c),
             truth,
             known,

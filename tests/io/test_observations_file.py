@@ -215,7 +215,7 @@ BAD = {
     ),
     "an offset without a unit": (
         replace("unknown_names", np.array(["yaw", "instrument.insertion_mm", "clock_s"])),
-        "unknown_names: expected clock_s, or a joint's name that ends in its unit, _rad or _mm, found 'yaw'",
+        "unknown_names: expected clock_s, clock_rate, or a joint's name that ends in its unit, _rad or _mm, found",
     ),
     "an offset named twice": (
         replace("unknown_names", np.array(["clock_s", "instrument.insertion_mm", "clock_s"])),

@@ -82,8 +82,10 @@ def test_first_order_displacement_is_that_of_the_kinematics(solved):
     base = Problem.from_observations(seen).flatten_batch()
     step = torch.full((1, len(unknowns.columns)), 2e-4, dtype=torch.float64)
     at = torch.as_tensor(seen.unknown_at)
-    file = FileUnknowns(seen, "cpu").at(base, at[:-1] + step, at[-1:] + 1e-3)
-    there, _ = unknowns.motion_poses(poses.frames, at[:-1] + step[0], float(at[-1]) + 1e-3)
+    joints, (offset_s, rate) = at[:-2], at[-2:].tolist()
+    moved = (offset_s + 1e-3, rate + 1e-4)  # 0.75 ms at the ends
+    file = FileUnknowns(seen, "cpu").at(base, joints + step, torch.tensor([moved], dtype=torch.float64))
+    there, _ = unknowns.motion_poses(poses.frames, joints + step[0], moved)
 
     def point(T, v, s):
         return (T[..., :3, :3] @ (v * s[..., None])[..., None])[..., 0] + T[..., :3, 3]

@@ -67,7 +67,7 @@ def test_offsets_of_joints_and_clock_move_it_as_they_move_the_shaft(arrays):
     problem = replace(
         problem,
         joint_derivative=joint,
-        clock_derivative=torch.randn(2, n, 6, generator=generator, dtype=torch.float64) * scale,
+        clock_derivative=torch.randn(2, n, 6, 2, generator=generator, dtype=torch.float64) * scale[:, None],
         joint_offset_sigma=torch.full((2, 2), 0.05, dtype=torch.float64),
     )
     settings = replace(FIXED, unknowns=UnknownSettings(joint_offsets="always", rcm_offset=True))

@@ -13,14 +13,14 @@ from rmis_calib.solver.tensors import axes_of, map_tensors
 def everything(problem):
     """The problem with all that it can hold."""
     b, n, j = *problem.valid.shape[:1], problem.n_motions, 5
-    one, none = torch.ones(b, n, 6, j, dtype=torch.float64), torch.zeros(b, dtype=torch.float64)
+    one = torch.ones(b, n, 6, j, dtype=torch.float64)
     return replace(
         problem,
         joint_derivative=one,
         joint_offset_sigma=one[:, 0, 0],
         joint_offset_at=one[:, 0, 0],
-        clock_derivative=one[..., 0],
-        clock_at=none,
+        clock_derivative=one[..., :2],
+        clock_at=one[:, 0, 0, :2],
         laparoscope_base_T_arm=problem.arm_T_rcm,
         laparoscope_base_T_instrument_base=problem.arm_T_rcm[:, 0],
         setup_stated=problem.arm_T_rcm[:, 0],

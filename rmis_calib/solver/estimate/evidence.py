@@ -19,7 +19,7 @@ from rmis_calib.solver.model.parameters import NuisancePriors, make_layout
 from rmis_calib.solver.problem import stands_still
 from rmis_calib.solver.settings import SolverSettings, UnknownSettings
 
-CHANCE = {"setup": 0.02, "compliance": 1e-4}
+CHANCE = {"clock_rate": 0.005, "setup": 0.02, "compliance": 1e-4}
 """Probability, with everything nominal, from which an unknown is freed: less for what costs more."""
 TESTED_MOTIONS = 2048
 """Long recordings are tested on a sample: what needs more motions to show is below the sigmas that matter."""
@@ -29,16 +29,16 @@ SEEN = 2.0
 
 def freed(unknowns: UnknownSettings, name: str) -> UnknownSettings:
     """The settings with a candidate estimated."""
-    return replace(unknowns, setup="prior") if name == "setup" else replace(unknowns, compliance="always")
+    return replace(unknowns, **{name: "prior" if name == "setup" else "always"})
 
 
 def chances(fit: MapEstimate, settings: SolverSettings) -> dict[str, Float[Tensor, " b"]]:
-    """Probability of what the data say if each candidate (`setup`, `compliance`) were nominal, for every trial; only
-    of those that are left out, and may be estimated."""
+    """Probability of what the data say if each candidate (`clock_rate`, `setup`, `compliance`) were nominal, for every
+    trial; only of those that are left out, and may be estimated."""
     asked, found, laparoscope = settings.unknowns, {}, fit.problem.laparoscope_base_T_arm
-    if laparoscope is None:
-        return {}
-    left_out = {"setup": asked.setup == "known", "compliance": asked.compliance == "auto"}
+    left_out = {"clock_rate": asked.clock_rate == "auto" and "clock" in fit.model.layout.blocks}
+    if laparoscope is not None:
+        left_out |= {"setup": asked.setup == "known", "compliance": asked.compliance == "auto"}
     for name in (name for name, is_left_out in left_out.items() if is_left_out):
         nominal, model = NuisancePriors.of(fit.problem), fit.model
         layout = make_layout(nominal, model.measured, model.layout.origin, freed(asked, name), settings.noise)
@@ -53,7 +53,8 @@ def chances(fit: MapEstimate, settings: SolverSettings) -> dict[str, Float[Tenso
             expected = expected_score(model, fit.state, settings.bias_motions, settings.seed)
             found[name] = _chance(normal.H, normal.g - expected.g, layout.sigma, layout.blocks[name])
         # A camera that stands still cannot tell a bend of the shaft from an error of the picture.
-        found[name] = torch.where(stands_still(laparoscope), 1.0, found[name])
+        if laparoscope is not None and name != "clock_rate":
+            found[name] = torch.where(stands_still(laparoscope), 1.0, found[name])
     return found
 
 

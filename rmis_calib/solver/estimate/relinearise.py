@@ -1,6 +1,6 @@
 """Joint offsets, the clock and the set-up: unknowns that act through the kinematics.
 
-The caller hands in `kinematics(joint_offset, clock_s)`: the problem with both arms' poses evaluated at these offsets,
+The caller hands in `kinematics(joint_offset, clock)`: the problem with both arms' poses evaluated at these offsets,
 their derivatives with it. The solver estimates increments from the derivatives, has the kinematics evaluated again
 there, and repeats until the increments vanish. The set-up (the pose of one arm's base in the other's) needs no such
 function: a problem with the laparoscope's own kinematics is put to another one exactly (`Problem.at_setup`).
@@ -26,9 +26,9 @@ from rmis_calib.solver.start.candidates import find_candidates
 from rmis_calib.solver.start.line_statistics import LineStatistics
 
 Kinematics = Callable[..., Problem]
-"""(joint offsets (b, j), clock offsets in s (b,)) -> problem with that trial axis, `joint_offset_at` and `clock_at`
-set. Where the set-up is an unknown too, the `laparoscope_base_T_instrument_base` to evaluate at is a third argument,
-(b, 4, 4)."""
+"""(joint offsets (b, j), clock offset in s and rate (b, 2)) -> problem with that trial axis, `joint_offset_at` and
+`clock_at` set. Where the set-up is an unknown too, the `laparoscope_base_T_instrument_base` to evaluate at is a third
+argument, (b, 4, 4)."""
 
 ROUNDS = 5
 SETTLED_SIGMA = 0.05
@@ -38,18 +38,19 @@ SCAN_GRID = 240
 
 
 def scan_clock(
-    kinematics: Kinematics, joints: int, offsets_s: Float[Tensor, " k"]
-) -> tuple[float, Float[Tensor, " k"]]:
-    """The candidate clock offset at which lines and joints agree best, and the score of each (mean squared sine).
+    kinematics: Kinematics, joints: int, clocks: Float[Tensor, "k 2"]
+) -> tuple[Float[Tensor, " 2"], Float[Tensor, " k"]]:
+    """The candidate clock (offset and rate) at which lines and joints agree best, and the score of each (mean squared
+    sine).
 
     Candidates at which fewer than half as many motions are valid as at the best covered one do not compete.
     """
-    problem = kinematics(offsets_s.new_zeros(offsets_s.shape[0], joints), offsets_s)
+    problem = kinematics(clocks.new_zeros(clocks.shape[0], joints), clocks)
     statistics = LineStatistics.from_problem(problem)
     count = statistics.count.sum(-1)
     score = find_candidates(statistics, SCAN_GRID, 2).score.amin(-1)
     score = torch.where(count >= 0.5 * count.amax(), score, torch.inf)
-    return float(offsets_s[score.argmin()]), score
+    return clocks[score.argmin()], score
 
 
 def solve_relinearised(problem: Problem, settings: SolverSettings, kinematics: Kinematics | None) -> MapEstimate:
@@ -65,11 +66,11 @@ def solve_relinearised(problem: Problem, settings: SolverSettings, kinematics: K
         if _settled(fit):
             break
         joint_offset = _at(problem.joint_offset_at, fit.state.joint_offset) + fit.state.joint_offset
-        clock_s = _at(problem.clock_at, fit.state.clock) + fit.state.clock
+        clock = _at(problem.clock_at, fit.state.clock) + fit.state.clock
         setup = None
         if "setup" in fit.model.layout.blocks:
             setup = problem.chains[1] @ rigid_exp(fit.state.setup)
-        problem = evaluated(problem, kinematics, joint_offset, clock_s, setup)
+        problem = evaluated(problem, kinematics, joint_offset, clock, setup)
         fit = map_estimate(problem, settings, fit)
     return fit
 
@@ -78,12 +79,12 @@ def evaluated(
     problem: Problem,
     kinematics: Kinematics | None,
     joint_offset: Float[Tensor, "b j"],
-    clock_s: Float[Tensor, " b"],
+    clock: Float[Tensor, "b 2"],
     setup: Float[Tensor, "b 4 4"] | None,
 ) -> Problem:
     """The problem at these offsets and this set-up; None: as it is stated."""
     if kinematics is not None:
-        return kinematics(joint_offset, clock_s) if setup is None else kinematics(joint_offset, clock_s, setup)
+        return kinematics(joint_offset, clock) if setup is None else kinematics(joint_offset, clock, setup)
     return problem if setup is None else problem.at_setup(setup)
 
 
@@ -101,10 +102,10 @@ def _at(value: Tensor | None, like: Tensor) -> Tensor:
 
 def _settled(fit: MapEstimate) -> bool:
     sigma = fit.covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
-    for name in ("joint_offset", "clock", "setup"):
-        if name in fit.model.layout.blocks:
-            moved = getattr(fit.state, name)
-            moved = moved if moved.ndim == 2 else moved[:, None]
-            if bool((moved.abs() > SETTLED_SIGMA * sigma[:, fit.model.layout.blocks[name]]).any()):
-                return False
+    moves = {"joint_offset": fit.state.joint_offset, "setup": fit.state.setup}
+    moves |= {"clock": fit.state.clock[:, :1], "clock_rate": fit.state.clock[:, 1:]}
+    for name, moved in moves.items():
+        part = fit.model.layout.blocks.get(name)
+        if part is not None and bool((moved.abs() > SETTLED_SIGMA * sigma[:, part]).any()):
+            return False
     return True

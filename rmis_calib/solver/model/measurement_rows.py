@@ -89,7 +89,7 @@ class MeasurementRows:
         camera_R: `camera_R_camera_right` as given, batch last.
         camera_t: its translation.
         joint: displacement of the shaft per unit of joint offset, in `arm`; None where unknown.
-        clock: displacement per second, in `arm`.
+        clock: displacement per second, and per unit of the clock's rate, in `arm`.
         setup: displacement per unit of each component of the set-up's perturbation (`State.setup`), in `arm`; None
             where the set-up cannot be an unknown.
         pose: of the instrument, scaled (model/compliance.py).
@@ -118,7 +118,7 @@ class MeasurementRows:
     camera_t: Float[Tensor, "3 c b"]
     pose: Float[Tensor, "3 b n"]
     joint: Float[Tensor, "6 j b n"] | None = None
-    clock: Float[Tensor, "6 b n"] | None = None
+    clock: Float[Tensor, "6 2 b n"] | None = None
     setup: Float[Tensor, "6 6 b n"] | None = None
     own: tuple[OwnRows, ...] = ()
     autograd: bool = False
@@ -239,12 +239,10 @@ def pack(problem: Problem, noise: NoiseSettings) -> MeasurementRows:
     head_xy, head_var, head_ok = _points(
         problem.head_xy, problem.head_sigma, problem.valid & heads_known[:, None], image
     )
-    joint = (
-        None
-        if problem.joint_derivative is None
-        else _to_arm(arm_R_rcm[:, :, None], batch_last(problem.joint_derivative, 2))
+    joint, clock = (
+        None if derivative is None else _to_arm(arm_R_rcm[:, :, None], batch_last(derivative, 2))
+        for derivative in (problem.joint_derivative, problem.clock_derivative)
     )
-    clock = None if problem.clock_derivative is None else _to_arm(arm_R_rcm, batch_last(problem.clock_derivative, 1))
     camera = problem.camera_T_camera_right.permute(2, 3, 1, 0).contiguous()
     return MeasurementRows(
         p=batch_last(problem.arm_T_rcm[..., :3, 3], 1),

@@ -29,6 +29,7 @@ UNITS = {
     "rcm_offset": "mm",
     "joint_offset": "rad or mm",
     "clock": "s",
+    "clock_rate": "relative",
     "edge_bias": "focal lengths",
     "intrinsics": "relative, focal lengths, k1",
     "setup": "rad, mm",
@@ -102,7 +103,8 @@ class ParameterLayout:
             "end_offset": (state.end_offset - origin.end_offset)[:, None],
             "rcm_offset": state.rcm_offset - origin.rcm_offset,
             "joint_offset": state.joint_offset - origin.joint_offset,
-            "clock": (state.clock - origin.clock)[:, None],
+            "clock": (state.clock - origin.clock)[:, :1],
+            "clock_rate": (state.clock - origin.clock)[:, 1:],
             "edge_bias": (state.edge_bias - origin.edge_bias).flatten(1),
             "intrinsics": (state.intrinsics - origin.intrinsics).flatten(1),
             "setup": state.setup - origin.setup,
@@ -135,7 +137,7 @@ class NuisancePriors:
     stereo_rad: Float[Tensor, " b"]
     joint_offset_sigma: Float[Tensor, "b j"]
     joint_offset_at: Float[Tensor, "b j"]
-    clock_at: Float[Tensor, " b"]
+    clock_at: Float[Tensor, "b 2"]
     edge_bias: Float[Tensor, "b l c"]
     intrinsics: Float[Tensor, "b c 4"]
     setup_at: Float[Tensor, "b 6"]
@@ -147,7 +149,7 @@ class NuisancePriors:
         """Of a problem with one trial axis."""
         level = problem.noise
         intrinsics = torch.stack((level.focal, level.centre, level.centre, level.lens), dim=-1)
-        none = problem.radius_mm.new_zeros(problem.n_trials, 0)
+        none, still = (problem.radius_mm.new_zeros(problem.n_trials, width) for width in (0, 2))
         sigma = none if problem.joint_offset_sigma is None else problem.joint_offset_sigma
         return cls(
             stereo=problem.camera_T_camera_right[:, -1],
@@ -156,7 +158,7 @@ class NuisancePriors:
             stereo_rad=problem.noise.stereo_rad,
             joint_offset_sigma=sigma,
             joint_offset_at=torch.zeros_like(sigma) if problem.joint_offset_at is None else problem.joint_offset_at,
-            clock_at=torch.zeros_like(problem.radius_mm) if problem.clock_at is None else problem.clock_at,
+            clock_at=still if problem.clock_at is None else problem.clock_at,
             edge_bias=problem.noise.edge_bias[:, None, None].expand(-1, line_points(problem), problem.n_cameras),
             intrinsics=intrinsics[:, None].expand(-1, problem.n_cameras, -1),
             setup_at=_setup_at(problem),
@@ -191,7 +193,7 @@ def initial_state(nominal: NuisancePriors, R: Float[Tensor, "b 3 3"], t: Float[T
         end_offset=zero,
         rcm_offset=zero[:, None].expand(-1, 2),
         joint_offset=torch.zeros_like(nominal.joint_offset_at),
-        clock=zero,
+        clock=torch.zeros_like(nominal.clock_at),
         edge_bias=torch.zeros_like(nominal.edge_bias),
         intrinsics=torch.zeros_like(nominal.intrinsics),
         setup=torch.zeros_like(nominal.setup_at),
@@ -224,6 +226,8 @@ def make_layout(
         entries.append(("joint_offset", measured.joint.shape[1], nominal.joint_offset_sigma))
     if settings.clock and measured.clock is not None:
         entries.append(("clock", 1, torch.full_like(infinite, settings.clock_sigma_s)))
+        if settings.clock_rate == "always":
+            entries.append(("clock_rate", 1, torch.full_like(infinite, settings.clock_rate_sigma)))
     if settings.edge_bias:
         entries.append(("edge_bias", origin.edge_bias[0].numel(), nominal.edge_bias.flatten(1)))
     if settings.intrinsics:
@@ -330,8 +334,8 @@ def _displaced(name: str, linear: LinearisedRows, measured: MeasurementRows, sta
         return effects if name == GIVEN_WAY else (effects[:, None] * basis(measured.pose)[:, None]).flatten(0, 1)
     if measured.setup is not None and name == "setup":
         return torch.stack([_effect(linear, R, motion) for motion in measured.setup.unbind(1)])
-    if measured.clock is not None and name == "clock":
-        return _effect(linear, R, measured.clock)[None]
+    if measured.clock is not None and name in ("clock", "clock_rate"):
+        return _effect(linear, R, measured.clock[:, int(name == "clock_rate")])[None]
     raise InputError(where=name, expected="derivatives of the kinematics", found="none")
 
 

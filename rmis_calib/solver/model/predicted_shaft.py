@@ -82,7 +82,7 @@ def corrected_shaft(measured: MeasurementRows, state: State) -> tuple[Tensor, Te
     if measured.joint is not None and matters(state.joint_offset):
         displacement = (measured.joint * state.joint_offset.T[:, :, None]).sum(1)
     if measured.clock is not None and matters(state.clock):
-        moved = measured.clock * state.clock[:, None]
+        moved = (measured.clock * state.clock.T[:, :, None]).sum(1)
         displacement = moved if displacement is None else displacement + moved
     if measured.setup is not None and matters(state.setup):
         moved = (measured.setup * state.setup.T[:, :, None]).sum(1)

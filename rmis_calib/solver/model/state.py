@@ -22,7 +22,8 @@ class State:
         end_offset: of the shaft's end along the axis, mm.
         rcm_offset: of the shaft's axis from the nominal RCM, along two directions across the axis, mm.
         joint_offset: in each joint's unit.
-        clock: seconds added to the time at which the joints were read.
+        clock: seconds added to the time at which the joints were read in the middle of the recording, and what is added
+            a second before and after it.
         edge_bias: shift across its line that a line row of each camera has in every motion alike, normalised units.
         intrinsics: corrections of each camera, in the order of `cameras.corrected_point`.
         setup: `laparoscope_base_T_instrument_base` from where the kinematics were evaluated: right perturbation,
@@ -39,7 +40,7 @@ class State:
     end_offset: Float[Tensor, " b"]
     rcm_offset: Float[Tensor, "b 2"]
     joint_offset: Float[Tensor, "b j"]
-    clock: Float[Tensor, " b"]
+    clock: Float[Tensor, "b 2"]
     edge_bias: Float[Tensor, "b l c"]
     intrinsics: Float[Tensor, "b c 4"]
     setup: Float[Tensor, "b 6"]
@@ -80,9 +81,12 @@ class State:
                 changed[name] = getattr(self, name) + step[name]
         if "translation" in step:
             changed["t"] = self.t + step["translation"]
-        for name in ("radius", "end_offset", "clock"):
+        for name in ("radius", "end_offset"):
             if name in step:
                 changed[name] = getattr(self, name) + step[name][:, 0]
+        parts = [step[name][:, 0] if name in step else self.clock[:, 0] * 0.0 for name in ("clock", "clock_rate")]
+        if "clock" in step or "clock_rate" in step:
+            changed["clock"] = self.clock + torch.stack(parts, dim=-1)
         if "edge_bias" in step:
             changed["edge_bias"] = self.edge_bias + step["edge_bias"].reshape(self.edge_bias.shape)
         if "intrinsics" in step:

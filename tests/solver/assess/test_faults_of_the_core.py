@@ -83,16 +83,16 @@ def test_thinning_works_beside_joint_offsets(simulate, realistic):
     generator = torch.Generator().manual_seed(3)
     derivative = torch.randn((1, problem.n_motions, 6, 2), generator=generator, dtype=torch.float64)
 
-    def kinematics(joint_offset, clock_s):
+    def kinematics(joint_offset, clock):
         return replace(
             problem,
             joint_derivative=derivative,
             joint_offset_sigma=torch.full((1, 2), 1e-3, dtype=torch.float64),
             joint_offset_at=joint_offset,
-            clock_at=clock_s,
+            clock_at=clock,
         )
 
-    start = kinematics(torch.zeros(1, 2, dtype=torch.float64), torch.zeros(1, dtype=torch.float64))
+    start = kinematics(torch.zeros(1, 2, dtype=torch.float64), torch.zeros(1, 2, dtype=torch.float64))
     found = solve(start, SolverSettings(thin_to=100), kinematics=kinematics)
     assert found.reason.shape[-1] == problem.n_motions
     assert int((found.reason == MotionReason.USED).sum()) > 90

@@ -16,7 +16,7 @@ from tests.benchmarks.bench_solver_nuisance import record
 
 KNOWN = UnknownSettings(radius_sigma_relative=0.0, stereo=False, joint_offsets="never")
 ZERO = torch.zeros(1, 6, dtype=torch.float64)
-STILL = torch.zeros(1, dtype=torch.float64)
+STILL = torch.zeros(1, 2, dtype=torch.float64)
 
 
 def kinematics_of(recorded):
@@ -27,9 +27,10 @@ def kinematics_of(recorded):
 def test_clock_offset_is_found(clock_s):
     recorded, truth = record(1, 120, 3, clock_s=clock_s)
     kinematics = kinematics_of(recorded)
-    candidates = torch.arange(-3.0, 3.01, 0.1, dtype=torch.float64)
+    offsets = torch.arange(-3.0, 3.01, 0.1, dtype=torch.float64)
+    candidates = torch.stack((offsets, torch.zeros_like(offsets)), dim=-1)
     found, _ = scan_clock(recorded.kinematics, 6, candidates)
-    assert found == pytest.approx(clock_s, abs=0.11)
+    assert float(found[0]) == pytest.approx(clock_s, abs=0.11)
     solution = solve(
         kinematics(ZERO, STILL + found), SolverSettings(unknowns=replace(KNOWN, clock=True)), kinematics=kinematics
     )
@@ -38,6 +39,27 @@ def test_clock_offset_is_found(clock_s):
     assert float(clock.sigma) < 0.005
     gap = torch.linalg.vector_norm(solution.camera_right_T_arm[0, :3, 3] - truth[0, :3, 3])
     assert float(gap) < 3.5 * float(solution.translation_sigma_mm)
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.002, -0.01])
+def test_the_rate_of_the_clock_is_freed_where_the_data_ask_for_it(rate):
+    """200 frames at 10 Hz: 1 % is 0.1 s at either end."""
+    recorded, truth = record(1, 200, 3, clock_s=0.03, rate=rate)
+    kinematics = kinematics_of(recorded)
+    unknowns = replace(KNOWN, clock=True)
+    solution = solve(kinematics(ZERO, STILL), SolverSettings(unknowns=unknowns), kinematics=kinematics)
+    assert ("clock_rate" in solution.nuisances) == bool(rate)
+    gap = torch.linalg.vector_norm(solution.camera_right_T_arm[0, :3, 3] - truth[0, :3, 3])
+    assert float(gap) < 3.5 * float(solution.translation_sigma_mm)
+    if not rate:
+        assert float(solution.evidence["clock_rate"]) > 0.005
+        return
+    found = solution.nuisances["clock_rate"]
+    assert float(found.value) == pytest.approx(rate, abs=4.0 * float(found.sigma))
+    assert float(found.sigma) < 5e-4
+    never = replace(unknowns, clock_rate="never")
+    ignored = solve(kinematics(ZERO, STILL), SolverSettings(unknowns=never), kinematics=kinematics)
+    assert "clock_rate" not in ignored.nuisances and "clock_rate" not in ignored.evidence
 
 
 def test_joint_offsets_are_estimated_or_held():

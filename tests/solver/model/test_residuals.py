@@ -14,7 +14,9 @@ from rmis_calib.solver.model.parameters import NuisancePriors, columns, initial_
 from rmis_calib.solver.model.residuals import linearise, residual_rows
 from rmis_calib.solver.settings import UnknownSettings
 
-EVERYTHING = UnknownSettings(rcm_offset=True, joint_offsets="always", clock=True, setup="prior", compliance="always")
+EVERYTHING = UnknownSettings(
+    rcm_offset=True, joint_offsets="always", clock=True, clock_rate="always", setup="prior", compliance="always"
+)
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +25,7 @@ def scene(simulate):
     n = problem.n_motions
     generator = torch.Generator().manual_seed(1)
     joint = torch.randn(1, n, 6, 2, generator=generator, dtype=torch.float64)
-    clock = torch.randn(1, n, 6, generator=generator, dtype=torch.float64)
+    clock = torch.randn(1, n, 6, 2, generator=generator, dtype=torch.float64)
     head = problem.rcm_p_head + torch.tensor([3.0, -2.0, 0.5])  # off the axis, so that turning about it shows
     one = torch.full((1,), 0.05, dtype=torch.float64)  # an exact stereo pair would not be refined
     problem = replace(
@@ -115,7 +117,7 @@ def test_jacobian_of_every_unknown_equals_autodiff(scene):
     layout = make_layout(NuisancePriors.of(problem), measured, state, settings.unknowns, settings.noise)
     assert list(layout.blocks) == [
         "rotation", "translation", "stereo_rotation", "stereo_translation", "radius", "end_offset", "rcm_offset",
-        "joint_offset", "clock", "edge_bias", "intrinsics", "setup", "compliance",
+        "joint_offset", "clock", "clock_rate", "edge_bias", "intrinsics", "setup", "compliance",
     ]  # fmt: skip
     exact = replace_measurements(measured, state)
     rows, shaft = linearise(exact, state)

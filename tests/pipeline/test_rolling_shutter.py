@@ -1,0 +1,78 @@
+"""Rows that are read one after the other: points are put to one instant, and head points are predicted at their own."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import data_synth
+import rmis_calib as rc
+from rmis_calib.config import parse_config
+from rmis_calib.geometry.cameras import Camera
+from rmis_calib.pipeline.calibration import run_calibration
+from rmis_calib.pipeline.poses import row_delay_s
+
+QUICK = parse_config({"solver": {"advice": {"motions": 0}, "bias_correction": False, "groups": 0}})
+READOUT_S = 0.02
+
+
+@pytest.fixture(scope="module")
+def rolling(tmp_path_factory):
+    """Arms in quick motion, seen by cameras that take 20 ms to read a picture, and say so."""
+    config = data_synth.load_synth_config("demo")
+    motion = replace(config.motion, kind="smooth", speed=3.0, joint_rate_hz=200.0)
+    camera = replace(config.camera, readout_s=READOUT_S, readout_told=True)
+    noise = replace(config.noise, kinematics_mm=0.0, kinematics_deg=0.0)
+    output = replace(config.output, pictures="images")
+    config = replace(config, motions=28, seed=3, motion=motion, camera=camera, noise=noise, output=output)
+    folder = data_synth.write_recording(tmp_path_factory.mktemp("rolling") / "recording", config)
+    recording = rc.load_recording(folder)
+    return folder, recording, run_calibration(recording, QUICK)
+
+
+def test_delays_run_from_the_first_row_to_the_last() -> None:
+    camera = Camera.from_values(500.0, 500.0, 300.0, 200.0, image_size=(401, 600))
+    v_px = torch.tensor([0.0, 200.0, 400.0, torch.nan, 900.0], dtype=torch.float64)
+    # By hand: the middle row of 401 is row 200; rows outside of the picture are not read later than its last.
+    assert row_delay_s(camera, v_px, 0.01).tolist() == pytest.approx([-0.005, 0.0, 0.005, 0.0, 0.005])
+
+
+def test_the_joints_are_read_with_the_middle_row(rolling) -> None:
+    folder, recording, _ = rolling
+    height = recording.right.size[0]
+    assert recording.rolling_shutter_s == pytest.approx(READOUT_S * (height - 1) / height)
+    # The generator's frame times are those of the middle rows.
+    np.testing.assert_allclose(recording.joint_times_s, np.load(folder / "truth.npz")["frame_times_s"], atol=1e-9)
+
+
+def test_points_are_moved_to_where_they_were_when_the_middle_row_was_read(rolling) -> None:
+    folder, _, run = rolling
+    truth = np.load(folder / "truth.npz")
+    for view, choice in zip(run.views, run.choices, strict=True):
+        rows, taken = torch.arange(len(choice.candidate)), choice.taken.numpy()
+        contour = view.at(run.poses.frames).contour_xy[rows, choice.candidate].double().numpy()[taken]
+
+        def off_px(name, contour=contour, side=view.side, taken=taken):
+            n = truth[f"{side}_{name}"][run.poses.frames][taken]
+            n = n / np.linalg.norm(n[..., :2], axis=-1, keepdims=True)
+            return 700.0 * ((contour * n[:, :, None, :2]).sum(-1) + n[:, :, None, 2])
+
+        at_middle, as_read = off_px("n_contour"), off_px("n_contour_read")
+        assert np.sqrt((at_middle**2).mean()) < 0.1
+        assert np.sqrt((as_read**2).mean()) > 5 * np.sqrt((at_middle**2).mean())  # what was measured
+
+
+def test_the_answer_is_that_of_the_shaft_and_evaluate_says_the_same(rolling) -> None:
+    folder, recording, run = rolling
+    result = run.result
+    assert any("Rows are read within 20 ms" in note for note in result.notes)
+    found = rc.evaluate(result, folder)
+    assert found.head_point_error_px is not None and result.head_point_error_px is not None
+    assert found.head_point_error_px["right"].median == pytest.approx(result.head_point_error_px["right"].median)
+    ignored = rc.calibrate(replace(recording, rolling_shutter_s=0.0), QUICK, throw=False)
+    worse = rc.evaluate(ignored, folder)
+    assert found.translation_error_mm is not None and worse.translation_error_mm is not None
+    assert found.translation_error_mm < 0.4 * worse.translation_error_mm
+    assert worse.head_point_error_px is not None
+    assert found.head_point_error_px["right"].median < 0.4 * worse.head_point_error_px["right"].median
