@@ -3,20 +3,44 @@
 Nothing here has to be set: `CalibrationConfig()` runs the whole pipeline. Precedence: defaults < one YAML file < flags.
 """
 
-from dataclasses import asdict, field
+from dataclasses import asdict, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import ConfigDict, TypeAdapter, ValidationError, field_validator
+from pydantic import ConfigDict, TypeAdapter, ValidationError, field_validator, model_validator
 from pydantic.dataclasses import dataclass
 
 from rmis_calib.errors import ConfigError
 from rmis_calib.io.configs import config_path, load_yaml
 from rmis_calib.io.validation import first_finding
-from rmis_calib.solver.settings import SolverSettings
+from rmis_calib.solver.settings import NotNegative, SolverSettings
 from rmis_calib.vision.settings import DetectorSettings
 
 Measurement = Literal["axis", "contours", "ends", "heads"]
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid", allow_inf_nan=False))
+class PictureErrors:
+    """Errors of pictures and cameras beyond what the detector claims: from them come the sigmas of the observations
+    (`sigma_contour_right`, ..., `sigma_edge_bias`, `sigma_focal`, `sigma_centre`, `sigma_lens`)."""
+
+    model_sigma_px: NotNegative = 0.3
+    """What the picture model leaves out (lens, glare, compression, a shaft not quite round): 1 sigma, px, added in
+    quadrature to what the detector claims for a contour or an end. Without it sharp pictures outvote the kinematics: on
+    the real recording of the tests the answer is 9.8 mm from the reference, with 0.3 px 3.6 mm, with 0.7 px 2.6 mm.
+    It is where the estimated noise level sets out from, not a floor: where the lines fit better the level falls (the
+    demo ends at a twentieth of it), unless `solver.noise.estimate` is `never`."""
+    edge_bias_px: NotNegative = 0.02
+    """Error of a contour point that every picture of a camera shares (lens model, edge detector), 1 sigma, px. It does
+    not average out, so each is an unknown with this prior. 0.02 to 0.04 px were measured on rendered pictures;
+    estimating it took a rendered recording from 0.084 deg and 0.25 mm off to 0.02 deg and 0.11 mm."""
+    focal_sigma_relative: NotNegative = 0.005
+    """How well the cameras' focal lengths are known, 1 sigma, relative. Where the data see them they are corrected;
+    where not (a camera that stands still absorbs a wrong one without a trace), this enters the covariance."""
+    centre_sigma_px: NotNegative = 3.0
+    """The same of the principal points, px per axis."""
+    lens_sigma: NotNegative = 0.03
+    """The same of the radial distortion k1."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid", allow_inf_nan=False))
@@ -44,23 +68,8 @@ class CalibrationConfig:
     Without it, and without a prior, it is the one that moves with the joints."""
     measurements: tuple[Measurement, ...] = ("axis", "contours", "ends")
     """What the estimate may use of each picture; `heads` are the labelled head points, else kept for evaluation."""
-    model_sigma_px: float = 0.3
-    """What the picture model leaves out (lens, glare, compression, a shaft not quite round): 1 sigma, px, added in
-    quadrature to what the detector claims for a contour or an end. Without it sharp pictures outvote the kinematics: on
-    the real recording of the tests the answer is 9.8 mm from the reference, with 0.3 px 3.6 mm, with 0.7 px 2.6 mm.
-    It is where the estimated noise level sets out from, not a floor: where the lines fit better the level falls (the
-    demo ends at a twentieth of it), unless `solver.noise.estimate` is `never`."""
-    edge_bias_px: float = 0.02
-    """Error of a contour point that every picture of a camera shares (lens model, edge detector), 1 sigma, px. It does
-    not average out, so each is an unknown with this prior. 0.02 to 0.04 px were measured on rendered pictures;
-    estimating it took a rendered recording from 0.084 deg and 0.25 mm off to 0.02 deg and 0.11 mm."""
-    focal_sigma_relative: float = 0.005
-    """How well the cameras' focal lengths are known, 1 sigma, relative. Where the data see them they are corrected;
-    where not (a camera that stands still absorbs a wrong one without a trace), this enters the covariance."""
-    centre_sigma_px: float = 3.0
-    """The same of the principal points, px per axis."""
-    lens_sigma: float = 0.03
-    """The same of the radial distortion k1."""
+    picture_errors: PictureErrors = field(default_factory=PictureErrors)
+    """What pictures and camera calibrations leave out."""
     clock_search_s: float = 3.0
     """With `solver.unknowns.clock`: clock offsets are searched this far to either side of the recording's own. Public
     recordings are off by up to 2.4 s."""
@@ -70,6 +79,16 @@ class CalibrationConfig:
     """Finding the shaft in a picture."""
     solver: SolverSettings = field(default_factory=SolverSettings)
     """Estimating the transform."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _picture_errors_in_their_group(cls, given: Any) -> Any:
+        """Settings that stood at the top once are refused with their place."""
+        names = given if isinstance(given, dict) else getattr(given, "kwargs", None) or {}
+        moved = [spec.name for spec in fields(PictureErrors) if spec.name in names]
+        if moved:
+            raise ValueError(f"expected {moved[0]} in the group picture_errors, found it outside")
+        return given
 
     @field_validator("device")
     @classmethod
@@ -86,9 +105,7 @@ class CalibrationConfig:
             raise ValueError("1 or more")
         return value
 
-    @field_validator(
-        "model_sigma_px", "edge_bias_px", "clock_search_s", "focal_sigma_relative", "centre_sigma_px", "lens_sigma"
-    )
+    @field_validator("clock_search_s")
     @classmethod
     def _not_negative(cls, value: float) -> float:
         if value < 0:

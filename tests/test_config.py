@@ -38,12 +38,25 @@ def test_mistakes_are_named(raw, words):
     assert "\n" not in str(caught.value)
 
 
+def test_a_setting_that_moved_is_refused_with_its_new_place():
+    with pytest.raises(
+        ConfigError, match=r"my\.yaml.*expected edge_bias_px in the group picture_errors, found it outside"
+    ):
+        parse_config({"edge_bias_px": 0.02}, where="my.yaml")
+    with pytest.raises(InputError, match="did you mean --picture-errors.edge-bias-px"):
+        parse("Calibrate", "calibrate", ["recording", "--edge-bias-px", "0.02"])
+
+
 @pytest.mark.parametrize(
     ("raw", "option", "words"),
     [
         ({"solver": {"grid": 3}}, ["--solver.grid", "3"], "expected 24 or more, found 3"),
         ({"solver": {"noise": {"image": -1}}}, ["--solver.noise.image", "-1"], "expected more than 0, found -1"),
-        ({"edge_bias_px": -1}, ["--edge-bias-px", "-1"], "expected 0 or more, found -1"),
+        (
+            {"picture_errors": {"edge_bias_px": -1}},
+            ["--picture-errors.edge-bias-px", "-1"],
+            "expected 0 or more, found -1",
+        ),
         (
             {"solver": {"verdict": {"trustworthy_mm": 30}}},
             ["--solver.verdict.trustworthy-mm", "30"],

@@ -35,10 +35,11 @@ def assemble(
         choices: candidate of every motion, one entry a view.
         config: what the pictures leave out.
     """
+    errors, focal = config.picture_errors, float(recording.stereo.right.focal)
     arrays: dict[str, Any] = {}
     for view, choice in zip(views, choices, strict=True):
         camera = recording.stereo.left if view.side == "left" else recording.stereo.right
-        model_sigma = config.model_sigma_px / float((camera or recording.stereo.right).focal)
+        model_sigma = errors.model_sigma_px / float((camera or recording.stereo.right).focal)
         arrays |= _measured(view.side, view.at(poses.frames), choice, model_sigma)
     extrinsics = recording.stereo.camera_left_T_camera_right
     return ShaftObservations(
@@ -48,10 +49,10 @@ def assemble(
         shaft_radius_mm=recording.shaft_diameter_mm / 2,
         **setup_observations(poses),
         rcm_s_end_mm=poses.rcm_s_end_mm.cpu().numpy(),
-        sigma_edge_bias=config.edge_bias_px / float(recording.stereo.right.focal),
-        sigma_focal=config.focal_sigma_relative,
-        sigma_centre=config.centre_sigma_px / float(recording.stereo.right.focal),
-        sigma_lens=config.lens_sigma,
+        sigma_edge_bias=errors.edge_bias_px / focal,
+        sigma_focal=errors.focal_sigma_relative,
+        sigma_centre=errors.centre_sigma_px / focal,
+        sigma_lens=errors.lens_sigma,
         **head_observations(recording, poses),
         **arrays,
     )

@@ -180,8 +180,8 @@ def test_output_below_a_file_cannot_be_written(recording, tmp_path, capsys):
             "--every: expected 1 or more, found 0",
         ),
         (
-            ["calibrate", "nowhere", "--out", "o", "--edge-bias-px", "-1"],
-            "--edge-bias-px: expected 0 or more, found -1",
+            ["calibrate", "nowhere", "--out", "o", "--picture-errors.edge-bias-px", "-1"],
+            "--picture-errors.edge-bias-px: expected 0 or more, found -1",
         ),
         (["solve", "absent.npz", "--out", "o.json"], "absent.npz"),
         (["evaluate", "absent.json", "nowhere"], "absent.json"),

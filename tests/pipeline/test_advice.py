@@ -23,7 +23,9 @@ from rmis_calib.solver.assess.observability import assess
 from rmis_calib.solver.observability import Observability
 
 SIGMA_PX = 0.2
-CONFIG = parse_config({"edge_bias_px": 0.0, "solver": {"bias_correction": False, "advice": {"candidates": 200}}})
+CONFIG = parse_config(
+    {"picture_errors": {"edge_bias_px": 0.0}, "solver": {"bias_correction": False, "advice": {"candidates": 200}}}
+)
 
 
 def written(path, laparoscope="static", motions=14):
@@ -150,7 +152,7 @@ def test_an_observations_file_gets_advice_as_the_picture_shows_it(weak):
 
 
 def test_no_advice_where_none_is_wanted_or_no_estimate_predicts(weak):
-    quiet = parse_config({"edge_bias_px": 0.0, "solver": {"advice": {"motions": 0}}})
+    quiet = parse_config({"picture_errors": {"edge_bias_px": 0.0}, "solver": {"advice": {"motions": 0}}})
     assert not rc.solve(weak[2], quiet, throw=False).observability.advice
     two_step = parse_config({"solver": {"method": "global"}})
     assert not rc.solve(weak[2], two_step, throw=False).observability.advice
@@ -173,7 +175,10 @@ def test_views_of_a_camera_and_of_measurements(weak):
 def test_motions_advised_together_are_distinct(weak):
     """A motion that shrinks the most twice over is still one motion to whoever moves the arms."""
     config = parse_config(
-        {"edge_bias_px": 0.0, "solver": {"bias_correction": False, "advice": {"candidates": 200, "motions": 5}}}
+        {
+            "picture_errors": {"edge_bias_px": 0.0},
+            "solver": {"bias_correction": False, "advice": {"candidates": 200, "motions": 5}},
+        }
     )
     _, record, _ = advised(weak, config)
     words = [motion.words for motion in record.next_motions]
