@@ -74,7 +74,7 @@ def _of_a_group(request: BaseException, lines: list[str]) -> InputError | None:
     if cause is None:
         return None
     # The first part of a group's name is the command's own field for all settings, which options do not name.
-    group = re.search(r"Error parsing \w+\.?([\w.]*)", " ".join(lines))
+    group = re.search(r"Error parsing \w+\.?([\w.-]*)", " ".join(lines))
     return finding_of_option(cause, group[1] if group else "", ConfigError)
 
 
