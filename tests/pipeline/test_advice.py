@@ -67,7 +67,7 @@ def advised(weak, config=CONFIG):
 
 def test_motions_stay_within_reach_and_limits(weak):
     recording, unknowns, _ = weak
-    logged = unknowns.readings_of_motions(0.0).numpy()
+    logged = unknowns.readings_of_motions().numpy()
     settings = CONFIG.solver.advice
     low, high = joint_box(recording, unknowns.columns, logged, settings)
     mm = np.array([column.endswith("_mm") for column in unknowns.columns])
