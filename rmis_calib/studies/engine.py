@@ -22,6 +22,8 @@ STUDY_FORMAT = "rmis-calib-study/1"
 RECORD, PAGE, STORE = "study.json", "index.html", "cells"
 _RETRIES = 2
 _MEMORY_SHARE = 0.9
+_SHARE_TO_JUDGE_BY = 0.01
+"""Before so much is done, start-up would pass for the speed."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +131,8 @@ class _Meter:
 
     def tell(self) -> None:
         share = sum(w * s for w, s in zip(self._weights, self._shares, strict=True)) / (sum(self._weights) or 1.0)
-        left_s = (time.monotonic() - self._begun) * (1.0 - share) / share if share > 0.0 else None
+        is_known = share > _SHARE_TO_JUDGE_BY
+        left_s = (time.monotonic() - self._begun) * (1.0 - share) / share if is_known else None
         self._progress(Progress(self._done, len(self._weights), self._stored, share, left_s))
 
 
