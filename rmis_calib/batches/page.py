@@ -15,10 +15,11 @@ from rmis_calib.batches.summary import PAGE, BatchSummary, end_of
 from rmis_calib.batches.task import RECORD, JobRecord
 from rmis_calib.io.atomic import atomic_write
 from rmis_calib.io.outputs import check_file, is_report
-from rmis_calib.report.content import HEADLINES, Headline, Pose, pose
-from rmis_calib.report.formatting import UNKNOWN, significant
+from rmis_calib.report.charts.repeatability import plot_repeatability
 from rmis_calib.report.page import template
-from rmis_calib.report.plots import plot_repeatability
+from rmis_calib.report.words.answer import Pose, pose
+from rmis_calib.report.words.formatting import UNKNOWN, significant
+from rmis_calib.report.words.verdict import HEADLINES, Headline
 
 _ENDS = {
     "failed": Headline("bad", "Failed"),

@@ -54,7 +54,7 @@ class CalibrationRun:
 
     def predicted_contours(self, view: View) -> Float[Tensor, "m 2 3"] | None:
         """Contour planes where the result puts the shaft, in one view's camera."""
-        camera_T_arm = self._camera_T_arm(view)
+        camera_T_arm = self.camera_T_arm(view)
         if camera_T_arm is None:
             return None
         return predict_contours(
@@ -63,13 +63,14 @@ class CalibrationRun:
 
     def predicted_ends(self, view: View) -> Float[Tensor, "m 3"] | None:
         """Where the result puts the shaft's end, mm, in one view's camera."""
-        camera_T_arm = self._camera_T_arm(view)
+        camera_T_arm = self.camera_T_arm(view)
         return (
             None
             if camera_T_arm is None
             else predict_ends(camera_T_arm, self.poses, self.result.nuisance("end_offset", 0.0))
         )
 
-    def _camera_T_arm(self, view: View) -> Float[Tensor, "4 4"] | None:
+    def camera_T_arm(self, view: View) -> Float[Tensor, "4 4"] | None:
+        """The answer in one view's camera; None without one."""
         transform = self.result.camera_right_T_arm if view.side == "right" else self.result.camera_left_T_arm
         return None if transform is None else transform.matrix.to(self.poses.arm_T_rcm.device)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from rmis_calib.errors import InputError
@@ -64,19 +64,25 @@ class PlacedCameras:
     working_covariance: Float[np.ndarray, "m 3 3"] | None
 
 
-def scene_of(recording: Recording, result: CalibrationResult | None = None) -> Scene:
+def scene_of(
+    recording: Recording, result: CalibrationResult | None = None, frames: Int[np.ndarray, " m"] | None = None
+) -> Scene:
     """The arms at every motion, with the offsets that a result found applied.
 
     Args:
         recording: an opened recording.
         result: of this recording; None: the arms as the joint log tells.
+        frames: numbers of the frames to show, increasing, whose joints are known; None: every such frame.
 
     Raises:
         RobotError: the robot's description cannot carry the recording's arms.
     """
     offsets = _NO_OFFSETS if result is None else result.kinematic_offsets
-    columns, frames, readings = _readings(recording, offsets.clock)
-    return _scene(recording, frames, readings, columns, result)
+    columns, known, readings = readings_of(recording, offsets.clock)
+    if frames is not None:
+        wanted = np.isin(known, frames)
+        known, readings = known[wanted], readings[torch.as_tensor(wanted)]
+    return _scene(recording, known, readings, columns, result)
 
 
 def advised_scene(recording: Recording, result: CalibrationResult) -> Scene | None:
@@ -84,7 +90,7 @@ def advised_scene(recording: Recording, result: CalibrationResult) -> Scene | No
     advice = result.observability.next_motions
     if not advice or advice[0].joints is None:
         return None
-    columns, frames, readings = _readings(recording, result.kinematic_offsets.clock)
+    columns, frames, readings = readings_of(recording, result.kinematic_offsets.clock)
     readings = readings[-1:].clone()
     for index, column in enumerate(columns):
         readings[:, index] = advice[0].joints.get(column, float(readings[0, index]))
@@ -132,7 +138,7 @@ def point_covariance(
     return J @ covariance @ J.T
 
 
-def _readings(
+def readings_of(
     recording: Recording, clock: tuple[float, float]
 ) -> tuple[tuple[str, ...], np.ndarray, Float[Tensor, "m j"]]:
     """Columns of the joint log that move the arms, the frames at whose times it is known, and their readings."""

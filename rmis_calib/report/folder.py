@@ -14,15 +14,16 @@ from rmis_calib.pipeline.calibration import run_calibration
 from rmis_calib.pipeline.detection import DetectionTable, Progress, View, no_progress
 from rmis_calib.pipeline.run import CalibrationRun
 from rmis_calib.report.detection_pictures import write_picture
+from rmis_calib.report.drawing.frames import overlays, spread
+from rmis_calib.report.drawing.overlays import Overlay
+from rmis_calib.report.material import gather_material
 from rmis_calib.report.overlay_video import write_overlay_videos
-from rmis_calib.report.overlays import Overlay
 from rmis_calib.report.page import write_report
-from rmis_calib.report.pictures import overlays, spread
 from rmis_calib.results import CalibrationResult
 from rmis_calib.vision import FrameReason
 
-REPORT_PICTURES = 12
-"""Pictures embedded in the page: enough to see every kind of view, few enough for a page of some 2 MB."""
+OVERLAYS = 12
+"""Overlays a camera that are written beside the report, unless told otherwise."""
 
 LINE_COLUMNS = (
     "camera", "frame", "candidate", "found", "reason", "confidence", "direction_known",
@@ -37,7 +38,7 @@ def calibrate_to_folder(
     config: CalibrationConfig,
     *,
     overwrite: bool = False,
-    overlays: int = REPORT_PICTURES,
+    overlays: int = OVERLAYS,
     overlay_video: bool = False,
     progress: Progress = no_progress,
 ) -> CalibrationResult:
@@ -79,25 +80,20 @@ def write_calibration_folder(folder: Path, run: CalibrationRun, count: int, vide
         run.observations.save(folder / "observations.npz")
     pictures = folder / "overlays"
     pictures.mkdir()
-    motions = len(run.poses.frames)
-    written, shown = spread(motions, count), spread(motions, max(1, REPORT_PICTURES // len(run.views)))
-    in_page = []
-    for overlay in overlays(run, np.union1d(written, shown)):
-        if overlay.frame in run.poses.frames[written]:
-            write_picture(pictures / f"{overlay.camera}_{overlay.frame:06d}.jpg", overlay.image)
-        if overlay.frame in run.poses.frames[shown]:
-            in_page.append(overlay)
+    for overlay in overlays(run, spread(len(run.poses.frames), count)):
+        write_picture(pictures / f"{overlay.camera}_{overlay.frame:06d}.jpg", overlay.drawn())
+    material = gather_material(run)
     name = run.recording.path.resolve().name
     write_report(
         folder / "report.html",
         run.result,
-        tuple(in_page),
-        title=f"Hand-eye calibration: {name}",
+        material,
+        title=name,
         source=name,
     )
     if video:
         write_overlay_videos(folder, run)
-    return tuple(in_page)
+    return material.pictures
 
 
 def write_lines(folder: Path, table: DetectionTable) -> None:

@@ -8,10 +8,10 @@ import numpy as np
 
 from rmis_calib.io.video_writing import OverlayVideo
 from rmis_calib.pipeline.run import CalibrationRun
-from rmis_calib.report.content import headline
 from rmis_calib.report.detection_pictures import playing_rate_hz
-from rmis_calib.report.overlays import Overlay
-from rmis_calib.report.pictures import overlays
+from rmis_calib.report.drawing.frames import overlays
+from rmis_calib.report.drawing.overlays import Overlay
+from rmis_calib.report.words.verdict import headline
 from rmis_calib.results import CalibrationResult
 
 THUMBNAIL_PX = (160, 120)
@@ -47,7 +47,7 @@ def write_overlay_videos(folder: Path, run: CalibrationRun) -> None:
             folder / f"overlay_{view.side}.mp4", (height + strip, width), playing_rate_hz(times_s)
         ) as video:
             for overlay in overlays(run, np.arange(len(run.poses.frames)), view.side):
-                video.add(np.concatenate([overlay.image, _strip(overlay, run.result, strip)]))
+                video.add(np.concatenate([overlay.drawn(), _strip(overlay, run.result, strip)]))
 
 
 def write_thumbnail(path: Path, drawn: Sequence[Overlay]) -> None:
@@ -62,10 +62,11 @@ def write_thumbnail(path: Path, drawn: Sequence[Overlay]) -> None:
     if not shown:
         return
     overlay = shown[len(shown) // 2]
-    height, width = overlay.image.shape[:2]
+    image = overlay.drawn()
+    height, width = image.shape[:2]
     scale = min(THUMBNAIL_PX[0] / width, THUMBNAIL_PX[1] / height)
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    small = cv2.resize(overlay.image, size, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     encoded = cv2.imencode(".jpg", np.ascontiguousarray(small[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 70])[1]
     path.write_bytes(encoded.tobytes())
 

@@ -14,12 +14,11 @@ import torch
 from jaxtyping import Float
 
 from rmis_calib.errors import InputError
-from rmis_calib.geometry.lines import contour_planes
-from rmis_calib.geometry.rigid import rigid_inverse, rotate_vectors, transform_points
+from rmis_calib.geometry.rigid import rigid_inverse, transform_points
 from rmis_calib.geometry.rotations import matrix_to_quat
 from rmis_calib.io import Recording, load_recording
 from rmis_calib.pipeline.scene import PlacedCameras, Scene, advised_scene, place_cameras, scene_of
-from rmis_calib.report.pictures import contour_polylines
+from rmis_calib.report.drawing.predicted import in_picture, shaft_edges
 from rmis_calib.results import CalibrationResult
 from rmis_calib.vision import draw_polyline
 
@@ -234,13 +233,11 @@ class Viewer:
         for name, shown in self._shown.items():
             at = min(motion, len(shown.scene.frames) - 1)
             camera_T_base = rigid_inverse(torch.as_tensor(shown.cameras.base_T_camera["right"][at]))
-            base_v = torch.as_tensor(shown.scene.end[at] - shown.scene.rcm[at])
-            p = transform_points(camera_T_base, torch.as_tensor(shown.scene.rcm[at]))
-            d = torch.nn.functional.normalize(rotate_vectors(camera_T_base, base_v), dim=-1)
+            rcm = transform_points(camera_T_base, torch.as_tensor(shown.scene.rcm[at]))
             camera = self._recording.stereo.right.corrected(*self._results[name].intrinsic_correction("right"))
             end = transform_points(camera_T_base, torch.as_tensor(shown.scene.end[at]))
-            for polyline in contour_polylines(contour_planes(p, d, shown.scene.radius_mm), camera, end):
-                draw_polyline(canvas, polyline / step, shown.colour, 2)
+            for edge in in_picture(camera, shaft_edges(rcm, end, shown.scene.radius_mm)):
+                draw_polyline(canvas, edge / step, shown.colour, 2)
         return canvas
 
     def _look_at_work(self) -> None:

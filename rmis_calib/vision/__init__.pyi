@@ -7,6 +7,7 @@ from .draw.overlay import draw_dot as draw_dot
 from .draw.overlay import draw_polyline as draw_polyline
 from .draw.stage_sheet import draw_stage_sheet as draw_stage_sheet
 from .draw.stages import draw_stages as draw_stages
+from .draw.strips import strip_edges as strip_edges
 from .masks import load_segmenter as load_segmenter
 from .settings import DetectorSettings as DetectorSettings
 from .straightness import StraightnessTable as StraightnessTable

@@ -3,13 +3,19 @@
 import dataclasses
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+import data_synth
+import rmis_calib as rc
 from rmis_calib.geometry.rigid import RigidTransform, rigid_exp
+from rmis_calib.pipeline.calibration import run_calibration
+from rmis_calib.pipeline.run import CalibrationRun
+from rmis_calib.report import gather_material, write_report
 from rmis_calib.results import CalibrationResult, Motions
 
 N_MOTIONS = 60
@@ -152,3 +158,62 @@ def failures() -> dict[str, CalibrationResult]:
             **nothing,
         ),
     }
+
+
+@pytest.fixture(scope="session")
+def rendered_run(tmp_path_factory: pytest.TempPathFactory) -> CalibrationRun:
+    """The calibration of a rendered stereo recording of 20 motions."""
+    path = tmp_path_factory.mktemp("report") / "recording"
+    data_synth.write_recording(path, data_synth.load_synth_config({"motions": 20, "seed": 7}))
+    return run_calibration(rc.load_recording(path))
+
+
+@pytest.fixture(scope="session")
+def run_with_rejections(rendered_run: CalibrationRun) -> CalibrationRun:
+    """The same, weak, as if three motions had been rejected for two reasons."""
+    used = rendered_run.result.motions.used.copy()
+    reasons = list(rendered_run.result.motions.reasons)
+    for motion, reason in ((3, "does not fit the other motions"), (9, "no straight edges stand out")):
+        used[motion], reasons[motion] = False, reason
+    used[15], reasons[15] = False, reasons[3]
+    motions = Motions(used, tuple(reasons), rendered_run.result.motions.timestamps_s)
+    weak = dataclasses.replace(rendered_run.result, status="weak", message="parts disagree", motions=motions)
+    return dataclasses.replace(rendered_run, result=weak)
+
+
+@pytest.fixture(scope="session")
+def refused_run(rendered_run: CalibrationRun) -> CalibrationRun:
+    """The same without an answer: four motions were usable, the others showed nothing."""
+    reasons = tuple("usable, but there are too few" if i < 4 else "no straight edges stand out" for i in range(20))
+    return dataclasses.replace(
+        rendered_run,
+        result=make_result(
+            status="insufficient_data",
+            message="Too few motions with a usable shaft: 4 of 20 motions are usable, 6 are needed",
+            camera_right_T_arm=None,
+            camera_left_T_camera_right=None,
+            covariance=None,
+            observability={"verdict": "unobservable", "sentences": ["4 of 20 motions are usable, 6 are needed"]},
+            motions=Motions(np.zeros(20, dtype=bool), reasons),
+            residuals={},
+            nuisances={},
+            head_point_error_px=None,
+            config=rendered_run.result.config,
+        ),
+        observations=None,
+        solution=None,
+    )
+
+
+RUNS = ("rendered_run", "run_with_rejections", "refused_run")
+
+
+@pytest.fixture(scope="session")
+def pages(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, str]]:
+    """Reports of a trustworthy, a weak and a refused calibration, as files and texts."""
+    folder, written = tmp_path_factory.mktemp("pages"), {}
+    for name in RUNS:
+        run: CalibrationRun = request.getfixturevalue(name)
+        write_report(folder / f"{name}.html", run.result, gather_material(run), title=name, source=name)
+        written[name] = (folder / f"{name}.html", (folder / f"{name}.html").read_text("utf-8"))
+    return written

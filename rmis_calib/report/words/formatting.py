@@ -34,3 +34,19 @@ def fixed(value: Any, decimals: int) -> str:
         return UNKNOWN
     text = f"{number:.{decimals}f}"
     return f"{0.0:.{decimals}f}" if float(text) == 0.0 else text
+
+
+def with_sigma(value: Any, sigma: Any) -> tuple[str, str]:
+    """A value and its sigma, the value with no more decimals than two digits of the sigma tell."""
+    number, spread = finite(value), finite(sigma)
+    if number is None or spread is None or spread <= 0.0:
+        return tiny_as_zero(number), significant(spread, 2)
+    decimals = max(0, 1 - math.floor(math.log10(spread)))
+    if decimals > 7:
+        return significant(number, 3), significant(spread, 2)
+    return fixed(number, decimals).replace("-", "−"), significant(spread, 2)
+
+
+def tiny_as_zero(number: float | None, digits: int = 3) -> str:
+    """A number whose scale is unknown; what only rounding made is 0."""
+    return significant(0.0 if number is not None and abs(number) < 1e-12 else number, digits)

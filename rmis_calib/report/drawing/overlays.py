@@ -1,35 +1,32 @@
-"""Pictures for the report: a frame with its detected and predicted contours, embedded as JPEG."""
+"""Pictures for the report: a frame with what is drawn on it, embedded as JPEG with the drawing beside it."""
 
 import base64
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
 
 from rmis_calib.errors import InputError, ShapeError
-
-DETECTED_RGB = (64, 224, 255)
-"""Colour of what was found in the image. Cyan: absent from tissue, and unlike amber for every kind of colour vision."""
-
-PREDICTED_RGB = (255, 176, 0)
-"""Colour of what the calibration predicts, drawn over the detected contours."""
+from rmis_calib.report.drawing.marks import Mark, draw_marks
 
 MAX_WIDTH_PX = 720
 """Widest embedded picture: twice the width of a column of the page, so that it stays sharp on a phone."""
 
-JPEG_QUALITY = 85
+JPEG_QUALITY = 82
 
 
 @dataclass(frozen=True)
 class Overlay:
-    """One frame with its contours drawn: detected in `DETECTED_RGB`, predicted in `PREDICTED_RGB`.
+    """One frame with what is to be drawn on it.
 
     Attributes:
         frame: index of the frame in the recording.
         camera: which camera saw it, `right` or `left`.
-        image: (height, width, 3) uint8, RGB, with the contours drawn.
+        image: (height, width, 3) uint8, RGB, as the camera saw it.
         caption: what there is to see, one line.
         used: whether this motion entered the estimate.
+        marks: what is drawn, raw px.
 
     Raises:
         ShapeError: the image is not a picture of that shape and type.
@@ -41,6 +38,7 @@ class Overlay:
     image: np.ndarray
     caption: str
     used: bool
+    marks: tuple[Mark, ...] = ()
 
     def __post_init__(self) -> None:
         image = self.image
@@ -50,6 +48,12 @@ class Overlay:
         if self.camera not in ("right", "left"):
             raise InputError(where="Overlay.camera", expected='"right" or "left"', found=repr(self.camera))
 
+    def drawn(self) -> UInt8[np.ndarray, "h w 3"]:
+        """A copy of the picture with the marks drawn into it."""
+        canvas = np.ascontiguousarray(self.image.copy())
+        draw_marks(canvas, self.marks)
+        return canvas
+
 
 @dataclass(frozen=True)
 class Picture:
@@ -57,25 +61,36 @@ class Picture:
 
     Attributes:
         overlay: what it shows.
-        data_uri: the JPEG, embedded.
-        width_px: width as embedded.
-        height_px: height as embedded.
+        data_uri: the JPEG without marks, embedded.
+        width_px, height_px: size as embedded.
+        marks: what is drawn, in px of the embedded picture.
     """
 
     overlay: Overlay
     data_uri: str
     width_px: int
     height_px: int
+    marks: tuple[Mark, ...]
+
+    @property
+    def words(self) -> str:
+        """What there is to see, for who cannot see it."""
+        overlay = self.overlay
+        labels = "".join(f" {mark.label}." for mark in self.marks if mark.label)
+        return f"Frame {overlay.frame}, {overlay.camera} camera. {overlay.caption}.{labels}"
 
 
-def embed(overlay: Overlay) -> Picture:
-    """The overlay as a JPEG data URI, no wider than `MAX_WIDTH_PX`."""
+def embed(overlay: Overlay, max_width_px: int = MAX_WIDTH_PX) -> Picture:
+    """The overlay with its picture as a JPEG data URI, no wider than that."""
     image = overlay.image
     height, width = image.shape[:2]
-    if width > MAX_WIDTH_PX:
-        height, width = max(1, round(height * MAX_WIDTH_PX / width)), MAX_WIDTH_PX
+    scale = min(1.0, max_width_px / width)
+    if scale < 1.0:
+        height, width = max(1, round(height * scale)), max_width_px
         image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
     bgr = np.ascontiguousarray(image[..., ::-1])
     encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
     payload = base64.b64encode(encoded.tobytes()).decode("ascii")
-    return Picture(overlay, f"data:image/jpeg;base64,{payload}", width, height)
+    # Pixel (0, 0) is the centre of the top-left pixel; an SVG's is its corner.
+    marks = tuple(Mark(mark.style, (mark.points + 0.5) * scale, mark.label) for mark in overlay.marks)
+    return Picture(overlay, f"data:image/jpeg;base64,{payload}", width, height, marks)

@@ -1,0 +1,132 @@
+"""Everything else that a result holds, in print: unknowns, sizes of residuals, groups, configuration."""
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rmis_calib.io.plain_values import finite_or_none
+from rmis_calib.report.charts.residuals import COLOURS, robust_scale
+from rmis_calib.report.words.formatting import significant, tiny_as_zero, with_sigma
+from rmis_calib.results import CalibrationResult, Residual
+
+_MEASUREMENTS = {
+    "contour": "Contours, distance of both edges",
+    "axis": "Axis line, distance",
+    "end": "Shaft end, distance along the shaft",
+    "head": "Head point, distance",
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One unknown or noise level: name, value, uncertainty, unit, and whether its prior holds it."""
+
+    name: str
+    value: str
+    sigma: str
+    unit: str
+    held: bool
+
+
+@dataclass(frozen=True)
+class SizeRow:
+    """How large residuals of one kind are."""
+
+    title: str
+    unit: str
+    count: int
+    median: str
+    rms: str
+    robust_scale: str
+
+
+@dataclass(frozen=True)
+class GroupRow:
+    """One group of neighbouring motions: its number, colour, size, and what the answer does without it."""
+
+    number: int
+    colour: int
+    motions: int
+    rotation_deg: str
+    translation_mm: str
+    sigmas: str
+
+
+def unknowns(result: CalibrationResult) -> tuple[Row, ...]:
+    """Everything else that was estimated or assumed, with its sigma."""
+    rows = []
+    for name, entry in result.nuisances.items():
+        value, sigma = with_sigma(entry.value, entry.sigma)
+        rows.append(Row(name, value, "" if entry.sigma is None else sigma, entry.unit, bool(entry.held)))
+    return tuple(rows)
+
+
+def unknowns_summary(rows: tuple[Row, ...]) -> str:
+    """How many there are of each kind."""
+    estimated = sum(bool(row.sigma) for row in rows)
+    held = sum(row.held for row in rows)
+    said = [f"{estimated} unknown{'s' if estimated != 1 else ''}"]
+    if held:
+        said.append(f"{held} of them held by {'its' if held == 1 else 'their'} prior{'' if held == 1 else 's'}")
+    if len(rows) > estimated:
+        said.append(f"{len(rows) - estimated} level{'s' if len(rows) - estimated != 1 else ''} without a sigma")
+    return ", ".join(said)
+
+
+def residual_sizes(result: CalibrationResult) -> tuple[SizeRow, ...]:
+    """Each kind of residual, in the order of the result."""
+    return tuple(_size(kind, entry, result) for kind, entry in result.residuals.items())
+
+
+def _size(kind: str, entry: Residual, result: CalibrationResult) -> SizeRow:
+    measurement, _, camera = kind.rpartition("_")
+    known = measurement in _MEASUREMENTS and camera in ("right", "left")
+    used = np.asarray(result.motions.used, dtype=bool)
+    used = used if len(used) == len(entry.by_motion) and measurement != "head" else np.ones(len(entry.by_motion), bool)
+    counted = entry.by_motion[np.isfinite(entry.by_motion) & used]
+    return SizeRow(
+        title=f"{_MEASUREMENTS[measurement]}, {camera} camera" if known else kind,
+        unit=entry.unit,
+        count=len(counted),
+        median=tiny_as_zero(entry.median),
+        rms=tiny_as_zero(entry.rms),
+        robust_scale=tiny_as_zero(robust_scale(counted) if len(counted) else None),
+    )
+
+
+def groups(result: CalibrationResult) -> tuple[GroupRow, ...]:
+    """Groups of neighbouring motions, as residuals are coloured by."""
+    if result.consistency is None:
+        return ()
+    return tuple(
+        GroupRow(
+            number=number,
+            colour=number % COLOURS,
+            motions=group.motions,
+            rotation_deg=significant(group.rotation_deg, 2),
+            translation_mm=significant(group.translation_mm, 2),
+            sigmas=significant(group.sigmas, 2),
+        )
+        for number, group in enumerate(result.consistency.groups)
+    )
+
+
+def head_point_errors(result: CalibrationResult) -> tuple[tuple[str, ...], ...]:
+    """Camera, median, rms, largest (px) and count."""
+    errors = result.head_point_error_px or {}
+    return tuple(
+        (camera, *(significant(distance) for distance in (error.median, error.rms, error.max)), str(error.count))
+        for camera, error in errors.items()
+    )
+
+
+def created(result: CalibrationResult) -> str:
+    """When the result was made, to the minute or second that it states, for readers rather than parsers."""
+    return result.created.replace("T", " ", 1).replace("+00:00", " UTC")
+
+
+def plain_json(value: Any) -> str:
+    """Indented JSON for the folded blocks."""
+    return json.dumps(finite_or_none(value), indent=2, ensure_ascii=False, default=str)
