@@ -17,8 +17,10 @@ from rmis_calib.pipeline import kinematic_unknowns
 from rmis_calib.pipeline.estimation import estimate_with_kinematics
 from rmis_calib.pipeline.found_offsets import poses_at
 from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
+from rmis_calib.pipeline.offsets import _about_offsets, _clock_start
 from rmis_calib.pipeline.poses import motion_poses
 from rmis_calib.results import KinematicOffsets
+from rmis_calib.solver.solution import Nuisance
 
 CLOCK_S = 0.72
 
@@ -104,6 +106,31 @@ def test_clock_offset_is_found_from_most_of_a_second_away(moving):
     moved = again.camera_right_T_arm[:3, 3] - solution.camera_right_T_arm[:3, 3]
     assert float(moved.norm()) < 0.05 * float(solution.translation_sigma_mm)  # what ends relinearisation
     assert float((again.nuisances["clock"].value - clock.value).abs()) < 0.05 * float(clock.sigma)
+
+
+def test_the_clock_is_searched_for_whatever_the_answer_may_use(moving):
+    recording = rc.load_recording(moving, clock_offset_s=0.0)
+    poses = motion_poses(recording)
+    unknowns = KinematicUnknowns(recording, poses.frames, "cpu")
+    config, like = parse_config({"measurements": ["contours"]}), torch.zeros(len(unknowns.columns), dtype=torch.float64)
+    start_s, rate = _clock_start(observations_from_truth(moving, recording, poses), config, unknowns, like)
+    assert start_s == pytest.approx(CLOCK_S, abs=0.03)
+    assert rate == 0.0
+
+
+def test_what_the_transform_absorbs_of_joint_offsets_is_said():
+    """Two joints of which only the sum shows, one that shows nothing, and a wrist's that moves nothing."""
+    columns = ("laparoscope.yaw_rad", "instrument.yaw_rad", "laparoscope.insertion_mm", "instrument.wrist_rad")
+    value = torch.zeros(4, dtype=torch.float64)
+    unseen = torch.zeros(4, 4, dtype=torch.float64)
+    unseen[:2, :2] = torch.tensor([[0.5, -0.5], [-0.5, 0.5]])
+    unseen[2, 2] = 1.0
+    held = torch.tensor([False, False, True, True])
+    offsets = Nuisance(value, value + 1e-3, "rad or mm", held, value, value[0], unseen)
+    said = _about_offsets(offsets, unseen, torch.tensor([True, True, True, False]), columns, 0.5)
+    assert "those of laparoscope.insertion cannot be told from the transform" in said
+    assert "a combination of those of laparoscope.yaw, instrument.yaw cannot be told from the transform" in said
+    assert "wrist" not in said
 
 
 @pytest.mark.parametrize("wrong", [0.01, -0.03])

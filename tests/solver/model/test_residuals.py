@@ -9,6 +9,7 @@ import torch
 from rmis_calib.geometry.lines import contour_planes
 from rmis_calib.geometry.rotations import rotvec_to_matrix
 from rmis_calib.solver import Problem, SolverSettings
+from rmis_calib.solver.model import predicted_shaft, residuals
 from rmis_calib.solver.model.measurement_rows import END, HEAD, LINE, pack
 from rmis_calib.solver.model.parameters import NuisancePriors, columns, initial_state, make_layout
 from rmis_calib.solver.model.residuals import linearise, residual_rows
@@ -175,3 +176,15 @@ def test_edges_are_put_into_canonical_order(simulate):
         f"contour_{side}": arrays[f"contour_{side}"][:, :, ::-1].copy() for side in ("right", "left")
     }
     torch.testing.assert_close(Problem.from_arrays(swapped).contour_xy, problem.contour_xy, equal_nan=True)
+
+
+def test_offsets_of_zero_change_nothing_where_they_are_not_looked_at(scene, monkeypatch):
+    """As on an accelerator, where asking whether they are zero would wait for all that is queued."""
+    _, measured, state, _ = scene
+    rows, linear = residual_rows(measured, state), linearise(measured, state)[0]
+    for module in (predicted_shaft, residuals):
+        monkeypatch.setattr(module, "matters", lambda offset: True)
+    torch.testing.assert_close(residual_rows(measured, state), rows, rtol=0, atol=1e-15)
+    again = linearise(measured, state)[0]
+    for name in ("r", "w", "a", "radius", "end"):
+        torch.testing.assert_close(getattr(again, name), getattr(linear, name), rtol=1e-12, atol=1e-12)
