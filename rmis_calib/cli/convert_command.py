@@ -16,8 +16,8 @@ from rmis_calib.convert.settings import ConvertSettings
 class Convert:
     """Make a recording of a ROS bag, a dVRK recorder's session, a data set, or pictures with a table.
 
-    ROS1 .bag, ROS2 (folder, .mcap, .db3), recorder mp4 with sidecar JSON and bag or CSV, SurgPose, SurgSync, or a
-    folder with right, left and a .csv. Topics are found by type and name; what is guessed is printed and kept in
+    ROS1 .bag, ROS2 (folder, .mcap, .db3), recorder mp4 with sidecar JSON and bag or CSV, SurgPose, SurgSync, LeRobot,
+    or a folder with right, left and a .csv. Topics are found by type and name; what is guessed is printed and kept in
     recording.yaml.
     """
 

@@ -30,7 +30,9 @@ class ConvertSettings:
     shaft_diameter_mm: float = 8.0
     """Diameter of the instrument's shaft."""
     map: dict[str, str] = field(default_factory=dict)
-    """Pictures with a table: our columns and its own, with a unit where it is another: instrument.yaw_rad q1:deg."""
+    """Tables, LeRobot: our columns and the source's, with a unit where it is another: instrument.yaw_rad q1:deg."""
+    episode: int | None = None
+    """Episode of a LeRobot data set (Open-H). Default: the only one."""
     rate_hz: float | None = None
     """Pictures a second, for pictures and tables without time stamps."""
     crop_right: tuple[int, int, int, int] | None = None

@@ -11,7 +11,7 @@ BAGS = (".bag", ".mcap", ".db3")
 VIDEOS = (".mp4", ".mkv", ".avi", ".mov")
 _KNOWN = (
     "a ROS1 .bag, a ROS2 bag (folder, .mcap, .db3), a folder with the mp4 and sidecar JSON of a dVRK recorder, "
-    "a SurgPose or SurgSync folder, or a folder with right, left and a table of joints (.csv)"
+    "a SurgPose, SurgSync or LeRobot folder, or a folder with right, left and a table of joints (.csv)"
 )
 _JIGSAWS_COLUMNS = 76
 
@@ -52,8 +52,9 @@ def _read_folder(job: Job, settings: ConvertSettings) -> tuple[Material, Convert
 
         return convert_surgsync(job, settings), settings
     if "meta" in names and (path / "meta" / "info.json").is_file():
-        expected = "the raw layout of a clip (image/, kinematic/, camera_calibration/)"
-        raise RecordingError(where=str(path), expected=expected, found="a LeRobot data set: unpack one episode of it")
+        from rmis_calib.convert.lerobot import convert_lerobot
+
+        return convert_lerobot(job, settings)
     _refuse_jigsaws(sorted([*path.glob("*.txt"), *path.glob("kinematics/**/*.txt")])[:3])
     videos = [entry for entry in path.iterdir() if entry.suffix.lower() in VIDEOS]
     if any(video.with_suffix(".json").is_file() for video in videos):

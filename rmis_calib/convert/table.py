@@ -31,16 +31,40 @@ def convert_table(job: Job, settings: ConvertSettings) -> tuple[Material, Conver
     Raises:
         RecordingError: no robot was named, a column is missing, or pictures and rows do not go together.
     """
+    require_robot(job, settings)
+    table = read_table(_only_table(job.source), note=job.note)
+    names, count, own_ns = _pictures(job)
+    row_ns = _row_ns(table, settings, count, job)
+    logs, settings = logs_of_table(table, row_ns, settings, job)
+    frame_ns = _frame_ns(job, settings, count, own_ns, row_ns)
+    return Material(logs, None, frame_ns, names["right"], names.get("left")), settings
+
+
+def require_robot(job: Job, settings: ConvertSettings) -> str:
+    """The robot that was named.
+
+    Raises:
+        RecordingError: none was.
+    """
     if settings.robot is None:
         expected = "--robot, whose joints the table's columns are (see `rmis-calib robots list`)"
         raise RecordingError(where=str(job.source), expected=expected, found="nothing")
-    robot = load_robot(settings.robot)
-    table = read_table(_only_table(job.source), note=job.note)
+    return settings.robot
+
+
+def logs_of_table(
+    table: Table, row_ns: np.ndarray, settings: ConvertSettings, job: Job
+) -> tuple[Logs, ConvertSettings]:
+    """Logs of the instrument's arm and, where the table has its columns, of the laparoscope's; and the settings that
+    name both.
+
+    Raises:
+        RecordingError: no robot was named, a column is missing, or of an unknown unit.
+    """
+    robot = load_robot(require_robot(job, settings))
     instrument, laparoscope = robot_arms(robot)
     instrument = settings.instrument or instrument
     laparoscope = settings.laparoscope or laparoscope
-    names, count, own_ns = _pictures(job)
-    row_ns = _row_ns(table, settings, count, job)
     arms = {}
     for name in (instrument, laparoscope):
         if name is None or name == "none" or name not in robot.arms:
@@ -58,9 +82,7 @@ def convert_table(job: Job, settings: ConvertSettings) -> tuple[Material, Conver
         log.joint_ns = [int(ns) for ns in row_ns]
         log.joints = list(np.stack([value for value in values if value is not None], axis=1))
         arms[name] = log
-    frame_ns = _frame_ns(job, settings, count, own_ns, row_ns)
-    settings = replace(settings, instrument=instrument, laparoscope=laparoscope or "none")
-    return Material(Logs(arms), None, frame_ns, names["right"], names.get("left")), settings
+    return Logs(arms), replace(settings, instrument=instrument, laparoscope=laparoscope or "none")
 
 
 def _only_table(folder: Path) -> Path:

@@ -327,10 +327,6 @@ def test_jigsaws_and_other_sources_are_refused_with_the_reason(tmp_path: Path) -
             RecordingError, match="kinematics of JIGSAWS: tip poses only, without RCM, joints or camera"
         ):
             convert(source, tmp_path / "out")
-    (tmp_path / "lerobot" / "meta").mkdir(parents=True)
-    (tmp_path / "lerobot" / "meta" / "info.json").write_text("{}")
-    with pytest.raises(RecordingError, match="found a LeRobot data set"):
-        convert(tmp_path / "lerobot", tmp_path / "out")
     with pytest.raises(RecordingError, match="expected a ROS1 .bag.* found an empty folder"):
         (tmp_path / "empty").mkdir()
         convert(tmp_path / "empty", tmp_path / "out")

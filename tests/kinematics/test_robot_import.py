@@ -11,6 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from rmis_calib.cli import main
+from rmis_calib.cli.equipment import robot_text
 from rmis_calib.errors import RobotError
 from rmis_calib.io.configs import config_names
 from rmis_calib.io.dvrk_robot import end_T_scope, import_dvrk, read_json5
@@ -179,6 +180,33 @@ def test_bases_in_different_frames_are_not_used(tmp_path: Path) -> None:
     assert any("different frames (left_camera and cart)" in note for note in notes)
     assert any("base_T_arm_base is left out" in note for note in notes)
     assert all(arm.base_T_arm_base is None for arm in robot.arms.values())
+
+
+def test_every_configuration_file_is_read(shared_data: Path) -> None:
+    """Against the standard library's parser, once comments are cut out by hand."""
+    files = sorted((shared_data / "dvrk" / "config").rglob("*.json"))
+    assert len(files) > 60
+    for path in files:
+        plain = re.sub(r"//.*|/\*.*?\*/", "", path.read_text(encoding="utf-8-sig"))
+        plain = re.sub(r",(\s*[\]}])", r"\1", re.sub(r"/\*.*?\*/", "", plain, flags=re.DOTALL))
+        assert read_json5(path) == json.loads(plain), path.name
+
+
+def test_real_placements_on_the_ecm_are_read_and_written_again(shared_data: Path, tmp_path: Path) -> None:
+    files = sorted((shared_data / "dvrk" / "registrations").rglob("*-registration-dVRK.json"))
+    assert len(files) == 4
+    paths = dvrk_files(tmp_path)
+    for path in files:
+        real = json.loads(path.read_text())
+        arms = [{"name": "ECM", "measured_cp": np.eye(4).tolist()}, real]  # as suj-fixed.json has them
+        system = tmp_path / f"{path.parent.name}-{path.name}"
+        system.write_text(json.dumps({"arms": arms}))
+        robot = import_dvrk(paths["arm"], paths["tool"], paths["ecm"], system, instrument_name=real["name"])
+        again = tmp_path / f"{system.stem}.yaml"
+        again.write_text(robot_text(robot))
+        found = np.asarray(load_robot(again).arms["instrument"].base_T_arm_base)
+        metres = found * np.where(np.arange(4) == 3, [[1e-3], [1e-3], [1e-3], [1.0]], 1.0)
+        np.testing.assert_allclose(metres, real["measured_cp"], rtol=0, atol=1e-12)
 
 
 def test_registrations_with_and_without_braces(shared_data: Path, tmp_path: Path) -> None:
