@@ -1,5 +1,6 @@
 from .calibration import calibrate as calibrate
 from .calibration import run_calibration as run_calibration
+from .detection import DetectionTable as DetectionTable
 from .detection import detect as detect
 from .estimation import solve as solve
 from .evaluation import Evaluation as Evaluation

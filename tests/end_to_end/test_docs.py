@@ -3,9 +3,12 @@ links lead somewhere. Blocks marked `py` instead of `python` need machines that 
 
 import re
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import yaml
+
+import rmis_calib as rc
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -40,6 +43,24 @@ def test_every_page_is_in_the_site():
     text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     listed = set(re.findall(r"([\w/]+\.md)", yaml.safe_dump(yaml.safe_load(text)["nav"])))
     assert listed == {page.name for page in (ROOT / "docs").glob("*.md")}
+
+
+def test_everything_public_is_in_the_reference():
+    entries = TEXTS["docs/python.md"].split()
+    public = {name: getattr(rc, name) for name in rc.__all__}
+    names = {
+        name: value.__name__ if isinstance(value, ModuleType) else f"{value.__module__}.{value.__qualname__}"
+        for name, value in public.items()
+    }
+    missing = [
+        name
+        for name, path in names.items()
+        if not any(
+            entry == path or path == entry.rpartition(".")[0] or entry.startswith(f"{path}.") for entry in entries
+        )
+        and path.rpartition(".")[0] not in entries
+    ]
+    assert not missing
 
 
 def test_the_readme_fits_one_sitting():
