@@ -29,6 +29,7 @@ def draw(comparison: SetupComparison, picture: Path) -> None:
     figure, ax = plt.subplots(figsize=(7, 4.4), layout="constrained")
     assert comparison.pooled is not None
     for place, (name, result) in enumerate(zip(comparison.names, comparison.results, strict=True)):
+        assert result.covariance is not None  # `compare` leaves results without one out
         sigma_mm = np.sqrt(np.diag(result.covariance)[3:])
         at = np.arange(3) + 0.15 * (place - 1)
         ax.errorbar(at, comparison.pooled.deviation[place, 3:], sigma_mm, fmt="o", capsize=4, label=name)

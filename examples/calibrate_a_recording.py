@@ -14,6 +14,7 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+import numpy as np
 import torch
 
 import data_synth
@@ -21,15 +22,16 @@ import rmis_calib as rc
 from rmis_calib.pipeline import CalibrationRun
 
 
-def predicted_px(run: CalibrationRun, motion: int) -> tuple[torch.Tensor, torch.Tensor]:
+def predicted_px(run: CalibrationRun, motion: int) -> tuple[np.ndarray, np.ndarray]:
     """Points of the shaft's axis, (n, 2) px of the right image, and the head point at the hinge of the jaws, (2,)."""
+    assert run.result.camera_right_T_arm is not None
     camera_T_rcm = run.result.camera_right_T_arm.matrix @ run.poses.arm_T_rcm[motion]
     distance_mm = run.poses.rcm_s_end_mm[motion] - torch.linspace(60.0, 0.0, 30, dtype=torch.float64)
     rcm_p_axis = distance_mm[:, None] * run.poses.rcm_v_axis[motion]
     rcm_p = torch.cat([rcm_p_axis, run.poses.rcm_p_head[motion][None]])
     camera_p = rcm_p @ camera_T_rcm[:3, :3].mT + camera_T_rcm[:3, 3]
     uv, _ = run.recording.stereo.right.project(camera_p)
-    return uv[:-1], uv[-1]
+    return uv[:-1].numpy(), uv[-1].numpy()
 
 
 def draw(run: CalibrationRun, picture: Path) -> None:
@@ -38,9 +40,9 @@ def draw(run: CalibrationRun, picture: Path) -> None:
     figure, axes = plt.subplots(2, 2, figsize=(10, 7.6), layout="constrained")
     for ax, motion in zip(axes.flat, motions, strict=True):
         frame = int(run.poses.frames[motion])
-        image = run.recording.right.frames([frame])[0]  # (3, h, w)
+        image = run.recording.right.frames([frame])[0].numpy()  # (3, h, w)
         axis, head = predicted_px(run, motion)
-        ax.imshow(image.permute(1, 2, 0))
+        ax.imshow(image.transpose(1, 2, 0))
         ax.plot(*axis.T, color="white", linewidth=2.5)
         ax.plot(*head, "o", color="magenta", markersize=9, markeredgecolor="white")
         ax.set(xlim=(0, image.shape[2] - 1), ylim=(image.shape[1] - 1, 0), xticks=[], yticks=[], title=f"frame {frame}")
@@ -59,6 +61,7 @@ def main(out: Path) -> tuple[rc.CalibrationResult, Path]:
     run = rc.run_calibration(recording)  # `rc.calibrate` is the same, and returns the result alone
     result = run.result
     print(result.status, result.message)
+    assert result.camera_right_T_arm is not None  # a failed calibration has no transform; `rc.calibrate` raises instead
     print(result.camera_right_T_arm.matrix)  # (4, 4), mm
 
     error = rc.evaluate(result, recording)  # against ground_truth.yaml, which the calibration never reads

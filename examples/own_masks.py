@@ -35,11 +35,11 @@ def draw(recording: rc.Recording, table: DetectionTable, picture: Path) -> None:
     frame = int(view.found.nonzero()[0])
     image = recording.right.frames([frame])[0]
     figure, axes = plt.subplots(1, 2, figsize=(11, 4.4), layout="constrained")
-    axes[0].imshow(segment(image[None] / 255.0)[0], cmap="gray")
+    axes[0].imshow(segment(image[None] / 255.0)[0].numpy(), cmap="gray")
     axes[0].set_title("mask")
-    axes[1].imshow(image.permute(1, 2, 0))
+    axes[1].imshow(image.permute(1, 2, 0).numpy())
     for contour in view.detections.contour_uv[frame, 0]:
-        axes[1].plot(*contour.T, color="orange", linewidth=2)
+        axes[1].plot(*contour.numpy().T, color="orange", linewidth=2)
     axes[1].set_title("contours found inside it")
     for ax in axes:
         ax.set(xlim=(0, image.shape[2] - 1), ylim=(image.shape[1] - 1, 0), xticks=[], yticks=[])

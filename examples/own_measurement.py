@@ -57,6 +57,7 @@ def draw(results: dict[str, rc.CalibrationResult], truth: np.ndarray, picture: P
     """Translation error along each axis, with the 1 sigma that each result claims."""
     figure, ax = plt.subplots(figsize=(7, 4.4), layout="constrained")
     for shift, (words, result) in zip((-0.1, 0.1), results.items(), strict=True):
+        assert result.camera_right_T_arm is not None and result.covariance is not None
         error_mm = result.camera_right_T_arm.matrix[:3, 3].numpy() - truth[:3, 3]
         sigma_mm = np.sqrt(np.diag(result.covariance)[3:])
         ax.errorbar(np.arange(3) + shift, error_mm, sigma_mm, fmt="o", capsize=5, label=f"{words}: {result.status}")
@@ -73,6 +74,7 @@ def main(out: Path) -> tuple[rc.CalibrationResult, rc.CalibrationResult, Path]:
     after = rc.solve(observations, measurements=[marker], throw=False)
     results = {"contours alone": before, "with the marker": after}
     for words, result in results.items():
+        assert result.camera_right_T_arm is not None
         error = np.linalg.norm(result.camera_right_T_arm.matrix[:3, 3].numpy() - truth[:3, 3])
         print(f"{words}: {result.status}, 1 sigma {result.translation_sigma_mm:.2f} mm, {error:.2f} mm off")
     print(f"residual of the marker: rms {after.residuals['tracked marker'].rms:.2f} mm")
