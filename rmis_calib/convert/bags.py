@@ -112,7 +112,7 @@ def _whole_bag(path: Path) -> str:
     """What was expected, and salvage only where it can help."""
     if can_salvage(path):
         return "a whole bag (--salvage converts what is whole of it)"
-    return "a bag of which something is whole"
+    return "a bag with an intact part"
 
 
 def _first_line(problem: Exception) -> str:

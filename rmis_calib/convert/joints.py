@@ -126,7 +126,9 @@ def _readings_of_poses(log: ArmLog, name: str, arm: Arm, note: Note) -> Readings
         raise RecordingError(
             where=log.name, expected=expected, found=f"poses up to {worst:.3g} mm off: another --robot?"
         )
-    what = f" with a wrist of {arm.joints[5].a_mm:g} mm: poses do not tell the tool" if arm.is_instrument else ""
+    what = (
+        f" with a wrist of {arm.joints[5].a_mm:g} mm: poses alone do not identify the tool" if arm.is_instrument else ""
+    )
     note(f"{log.name}: no joints are logged; they were computed from its poses{what}")
     return _increasing(np.array(log.pose_ns, dtype=np.int64), values, log.name, note)
 

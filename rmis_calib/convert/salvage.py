@@ -31,7 +31,7 @@ def salvaged(path: Path) -> Iterator[tuple[list[Topic], Messages]]:
     for topic, kind, _, _, _ in _records(files):
         counts[topic, kind] = counts.get((topic, kind), 0) + 1
     if not counts:
-        raise FileError(where=str(path), expected="a bag of which something is whole", found="no whole message")
+        raise FileError(where=str(path), expected="a bag with an intact part", found="no whole message")
     yield [Topic(name, kind, count) for (name, kind), count in counts.items()], lambda names: _decoded(files, names)
 
 

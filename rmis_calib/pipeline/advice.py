@@ -46,8 +46,8 @@ _PREDICTS = (SolveStatus.CONVERGED, SolveStatus.SINGULAR, SolveStatus.MAX_ITERAT
 PIVOT_BEHIND_MM = 120.0
 """Assumed distance of the laparoscope's trocar behind the camera."""
 WHERE = (
-    "near to the last motion (an observations file tells no joints, so they are named as the right picture shows them; "
-    "one of the laparoscope counts only where its arm is logged)"
+    "near the last motion (an observations file holds no joints, so motions are described as the right image shows "
+    "them; a motion of the laparoscope counts only if its arm is logged)"
 )
 _LEAST_ACROSS = 0.5
 """Sine to the shaft below which a direction of the picture is none in which the tip could swing."""
@@ -302,8 +302,8 @@ def seen_view(problem: Problem) -> Float[Tensor, "c 4"]:
 def limits_in_words(settings: AdviceSettings) -> str:
     """To what joint candidates are limited."""
     return (
-        f"within the joint limits, at most {settings.reach_deg:g} deg and {settings.reach_mm:g} mm outside of the "
-        "readings of the recording"
+        f"within the joint limits, at most {settings.reach_deg:g} deg and {settings.reach_mm:g} mm outside "
+        "the range of the recording"
     )
 
 

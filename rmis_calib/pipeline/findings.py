@@ -50,12 +50,12 @@ def about_motions(recording: Recording, poses: MotionPoses, config: CalibrationC
     found.append(Finding("joints", _ranges(recording, poses)))
     distinct = distinct_motions(poses)
     if distinct < config.min_motions:
-        sentence = f"{distinct} distinct motions: at least {config.min_motions} are needed, better 30 and more"
+        sentence = f"{distinct} distinct motions: at least {config.min_motions} are needed, 30 or more are better"
         return [*found, Finding("motion", sentence, is_doubt=True)]
     turn_deg, shift_mm = shaft_motion(poses)
     sentence = f"{distinct} distinct motions; the shaft turned by {turn_deg:.1f} deg and slid by {shift_mm:.0f} mm"
     too_small = turn_deg < _LEAST_TURN_DEG and shift_mm < _LEAST_SHIFT_MM
-    found.append(Finding("motion", sentence + (": move it by 10 deg and more" if too_small else ""), too_small))
+    found.append(Finding("motion", sentence + ("; move it by 10 deg or more" if too_small else ""), too_small))
     return found
 
 
@@ -85,12 +85,12 @@ def about_order(
         return []
     if looks_swapped(inverse_depth):
         sentence = (
-            "by its disparity the shaft lies behind the cameras: the right and the left pictures look swapped, or "
+            "the disparity puts the shaft behind the cameras: the right and the left pictures look swapped, or "
             "camera_left_T_camera_right is the inverse of what it should be"
         )
         return [Finding("stereo", sentence, is_doubt=True)]
     depth = f"{1.0 / inverse_depth:.0f} mm" if inverse_depth > 1e-3 else "a metre or more"
-    return [Finding("stereo", f"by its disparity the shaft is {depth} in front of the cameras")]
+    return [Finding("stereo", f"the disparity puts the shaft {depth} in front of the cameras")]
 
 
 def shaft_motion(poses: MotionPoses) -> tuple[float, float]:

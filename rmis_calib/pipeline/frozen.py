@@ -68,5 +68,5 @@ def about_repeats(side: str, frames: np.ndarray) -> str:
     named = ranges_in_words(frames.tolist())
     return (
         f"camera_{side}: {len(frames)} pictures repeat the one before although the joints moved (frames {named}); "
-        "they were left out: does the grabber hang, or were frames written twice?"
+        "they were left out: did the frame grabber stall, or were frames written twice?"
     )

@@ -124,7 +124,7 @@ def likely_causes(residuals: SignedResiduals, inverse_depth: float | None, repea
     """
     causes = []
     if repeated:
-        causes.append(f"{repeated} pictures repeat the one before (a grabber that hangs)")
+        causes.append(f"{repeated} pictures repeat the one before (a frame grabber that stalls)")
     if looks_swapped(inverse_depth):
         causes.append("the left and the right pictures look swapped")
     u, v = residuals.uv.T

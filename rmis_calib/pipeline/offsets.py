@@ -171,7 +171,7 @@ def _about_offsets(
     visible = [joint for *joint, moved in joints if moved]
     hidden = ", ".join(name for name, _, _, is_held, _ in visible if is_held)
     if all(is_held for _, _, _, is_held, _ in visible):
-        return f"Constant joint offsets cannot be told from the transform here, and are part of it ({hidden})."
+        return f"Constant joint offsets cannot be separated from the transform here, and are part of it ({hidden})."
     mixed = [name for name, _, _, is_held, share in visible if not is_held and share > MIXED_SHARE]
     seen = ", ".join(f"{name} {_shown(sigma, column)}" for name, column, sigma, is_held, _ in visible if not is_held)
     note = (
@@ -179,9 +179,11 @@ def _about_offsets(
         f"would measure them to (1 sigma): {seen}"
     )
     if hidden:
-        note += f"; those of {hidden} cannot be told from the transform and are part of it"
+        note += f"; those of {hidden} cannot be separated from the transform and are part of it"
     if len(mixed) > 1:
-        note += f"; a combination of those of {', '.join(mixed)} cannot be told from the transform and is part of it"
+        note += (
+            f"; a combination of those of {', '.join(mixed)} cannot be separated from the transform and is part of it"
+        )
     return f"{note}."
 
 

@@ -190,7 +190,7 @@ def _expected(run: CalibrationRun, config: CalibrationConfig) -> tuple[Finding, 
     solution, recording = run.solution, run.recording
     if solution is None or solution.posterior is None or run.observations is None or not may_advise(solution, config):
         why = run.result.message
-        return Finding("expected", f"the frames looked at do not tell the accuracy to expect ({why})"), (None, None)
+        return Finding("expected", f"the frames examined do not predict the accuracy ({why})"), (None, None)
     all_poses = motion_poses(recording, config.device)
     spread = np.unique(np.linspace(0, len(all_poses.frames) - 1, _PREDICTED_MOTIONS).astype(int))
     unknowns = KinematicUnknowns(recording, all_poses.frames[spread], config.device)

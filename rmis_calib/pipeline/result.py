@@ -104,8 +104,9 @@ def _about_tool(solution: Solution) -> tuple[str, ...]:
         return ()
     where = "beyond" if offset > 0 else "before"
     return (
-        f"The shaft ends {abs(offset):.0f} mm {where} the place that the tool's table tells: does the table belong "
-        "to another tool (the wrists of S/Si and Classic instruments are 50 mm apart), or is a wrist's length missing?",
+        f"The shaft ends {abs(offset):.0f} mm {where} the place given by the tool's table: does the table belong "
+        "to another tool (the wrists of S/Si and Classic instruments are 50 mm apart), or is the length of a wrist "
+        "missing?",
     )
 
 
@@ -115,7 +116,7 @@ def _about_ends(solution: Solution) -> tuple[str, ...]:
         return ()
     left_out, used = int(solution.ends_elsewhere), int(torch.isfinite(solution.residual_ends).sum())
     if not used:
-        return (f"The {left_out} measured ends of the shaft have no common place along it, and none was used.",)
+        return (f"The {left_out} measured shaft ends do not agree on one place along the shaft, and none was used.",)
     return (
         f"{left_out} of {left_out + used} measured ends of the shaft are at another place along it than most, and were "
         "left out (the ring of the tube in some pictures, the metal's tip or what lies over it in others?).",
@@ -151,7 +152,7 @@ def _strange_unknown(solution: Solution) -> str:
     if worst == "intrinsics":
         return (
             f"focal length, centre or lens of a camera are estimated {pulls[worst]:.0f} prior sigmas from what the "
-            "file says: is it of another picture size, a crop, or without its lens model, or the clock off?"
+            "file says: is the file for another image size, a crop or without the lens model, or is the clock off?"
         )
     where = f"the {worst.replace('_', ' ')} is estimated {pulls[worst]:.0f} prior sigmas from its nominal value"
     return f"{where}: are the cameras swapped, is a unit or a file wrong, or the clock off?"
@@ -253,8 +254,8 @@ def about_groups(consistency: Consistency | None) -> tuple[str, ...]:
     group = consistency.groups[worst]
     where = ranges_in_words(np.flatnonzero(consistency.group_by_motion == worst).tolist())
     return (
-        "Groups of neighbouring motions disagree by more than noise explains, so every sigma counts "
-        f"{consistency.inflation:.1f} times. Most of all the {group.motions} motions {where}: without them the answer "
+        "Groups of neighbouring motions disagree by more than noise explains, so all sigmas were multiplied by "
+        f"{consistency.inflation:.1f}. The {group.motions} motions {where} disagree most: without them the answer "
         f"moves by {group.rotation_deg:.2g} deg, {group.translation_mm:.2g} mm.",
     )
 
@@ -279,19 +280,20 @@ def about_cameras(solution: Solution) -> tuple[str, ...]:
             said.append(f"of the {('right', 'left')[camera]} camera {', '.join(changed)}")
     if not said:
         return ()
-    return (f"The pictures ask for other cameras: {'; '.join(said)}. The transform belongs to the corrected ones.",)
+    return (f"The data suggest corrected cameras: {'; '.join(said)}. The transform goes with them.",)
 
 
 def _contradiction(groups: GroupCheck) -> str:
     """Which parts of the data tell of different transforms."""
     if float(groups.change_sigmas) > CHANGED:
         return (
-            f"what comes before motion {int(groups.change_at)} and after differs by {_apart(groups.change[0])}, "
-            "beyond its sigmas: did the camera, a trocar or an arm's base move there?"
+            f"the motions before and after motion {int(groups.change_at)} differ by {_apart(groups.change[0])}, "
+            "more than their sigmas allow: did the camera, a trocar or an arm's base move there?"
         )
     return (
         f"two halves of the motions, far from each other in joint space, disagree by {_apart(groups.halves[0])}, "
-        "beyond their sigmas: what the model leaves out (lens, focal length, an arm's base, joints) is more than noise"
+        "more than their sigmas allow: errors outside the model (lens, focal length, an arm's base, joints) exceed "
+        "the noise"
     )
 
 

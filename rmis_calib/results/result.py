@@ -57,7 +57,7 @@ _ANSWER = (
 STATUS_SENTENCES: dict[str, str] = {
     "ok": "The result passed its own checks",
     "weak": "The data constrain the transform too loosely to be trusted",
-    "unobservable": "The data cannot tell the transform",
+    "unobservable": "The data do not determine the transform",
     "solver_failed": "The solver did not reach a solution",
     "insufficient_data": "Too few motions with a usable shaft",
 }

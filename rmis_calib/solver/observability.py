@@ -57,17 +57,17 @@ _SENTENCES = {
     Degeneracy.SINGLE_AXIS_MOTION: "the shaft turned about a single axis only",
     Degeneracy.ONE_PLANE: "all positions of the shaft lie in one plane",
     Degeneracy.MOTION_BELOW_NOISE: "the motion is below the noise of the kinematics",
-    Degeneracy.SHORT_BASELINE: "the stereo baseline is too short to tell depth",
-    Degeneracy.NO_ALONG_AXIS_CUE: "nothing tells the place along the shaft",
+    Degeneracy.SHORT_BASELINE: "the stereo baseline is too short to determine depth",
+    Degeneracy.NO_ALONG_AXIS_CUE: "nothing shows the position along the shaft",
     Degeneracy.SETUP_AND_TRANSFORM: (
-        "the laparoscope did not turn about two axes, so that its transform is not told from the unknown set-up"
+        "the laparoscope did not turn about two axes, so its transform cannot be separated from the unknown set-up"
     ),
 }
 
 
 _REMEDIES = {
     Degeneracy.STATIC_LAPAROSCOPE: "move the laparoscope's arm as well, with its joints logged",
-    Degeneracy.NO_DEPTH_CUE: "give the shaft's diameter, so that its width in the picture tells its distance",
+    Degeneracy.NO_DEPTH_CUE: "state the shaft's diameter, so that its width in the image gives its distance",
     Degeneracy.SINGLE_AXIS_MOTION: "turn the instrument about a second axis",
     Degeneracy.ONE_PLANE: "move the instrument out of the plane that it stayed in",
     Degeneracy.MOTION_BELOW_NOISE: "move farther: several degrees and centimetres",

@@ -25,7 +25,7 @@ _SENTENCES = {
     SolveStatus.MAX_ITERATIONS: "ran out of steps before the estimate settled",
     SolveStatus.STALLED: "no step improved the fit although it had not settled",
     SolveStatus.NON_FINITE: "a residual became infinite or undefined",
-    SolveStatus.SINGULAR: "the measurements leave a direction of the unknown entirely free",
+    SolveStatus.SINGULAR: "the measurements leave a direction of the transform entirely undetermined",
     SolveStatus.BEHIND_CAMERA: "the best fit puts the shaft behind the camera or its tip on the wrong side",
     SolveStatus.MISFIT: "the residuals are larger than the noise levels explain",
     SolveStatus.INCONSISTENT: (

@@ -36,7 +36,7 @@ class FrameReason(IntEnum):
 _SENTENCES = {
     FrameReason.OK: "a shaft was found",
     FrameReason.BAD_PIXELS: "the frame has values that are not finite numbers",
-    FrameReason.NO_PICTURE: "the frame is black, white or of one tone: nothing can be told apart in it",
+    FrameReason.NO_PICTURE: "the frame is black, white or uniform",
     FrameReason.NO_STRAIGHT_EDGES: "no straight edges stand out",
     FrameReason.NOT_A_CYLINDER: "no two edges enclose a strip that differs from both sides, as a shaft does",
     FrameReason.TOO_SHORT: "what looks like a shaft is too short, or never reaches the border of the picture",

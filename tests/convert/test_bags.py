@@ -153,7 +153,7 @@ def test_not_a_bag_at_all(tmp_path: Path, name: str) -> None:
     for content in (b"", b"nonsense", b"#ROSBAG V2.0\n", b"SQLite format 3\0" + b"\0" * 84):
         (tmp_path / name).write_bytes(content)
         for salvage in (False, True):
-            with pytest.raises(FileError, match="expected a bag of which something is whole, found") as caught:
+            with pytest.raises(FileError, match="expected a bag with an intact part, found") as caught:
                 convert(tmp_path / name, tmp_path / "out", ConvertSettings(salvage=salvage))
             assert "--salvage" not in str(caught.value)
     assert not (tmp_path / "out").exists()
