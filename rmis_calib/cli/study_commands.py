@@ -208,7 +208,8 @@ def conclude_study(result: "StudyResult") -> int:
         _print_table(table)
     for sentence in result.sentences:
         say(sentence)
-    summarise(f"study {result.kind}", *result.sentences[:1], f"written to {result.page}")
+    found = (sentence.rstrip(".") for sentence in result.sentences[:1])
+    summarise(f"study {result.kind}", *found, f"written to {result.page}")
     return EXIT_OK if result.reached else EXIT_NOT_TRUSTWORTHY
 
 

@@ -10,7 +10,7 @@ from rmis_calib.studies.cells import make_cells
 from rmis_calib.studies.engine import Watcher, run_cells, study_folder
 from rmis_calib.studies.output import StudyResult, output_names, write_record, write_study
 from rmis_calib.studies.page import Table
-from rmis_calib.studies.plots import Figure, Panel, axis_label, method_curves
+from rmis_calib.studies.plots import Figure, Panel, Series, Style, axis_label, method_curves
 from rmis_calib.studies.prepare import Ready, prepare
 from rmis_calib.studies.settings import PlanSettings
 from rmis_calib.studies.simulation import Condition
@@ -74,7 +74,7 @@ def study_plan(
         groups = summarise(table)
         result = StudyResult(
             "plan", table, tuple(group.row() for group in groups), tuple(_sentences(table, enough, ready, settings)),
-            (_figure(groups, ready, settings),), (_table(table, groups, ready, settings),), out,
+            (_figure(table, groups, ready, settings),), (_table(table, groups, ready, settings),), out,
             reached=enough is not None,
         )  # fmt: skip
         write_study(result, TITLE, about)
@@ -159,26 +159,38 @@ def _noise_in_words(ready: Ready, settings: PlanSettings) -> str:
     return f"{kinematics}; {points}; {stereo}"
 
 
-def _figure(groups: Sequence[Group], ready: Ready, settings: PlanSettings) -> Figure:
-    panels = []
+def _figure(table: "pyarrow.Table", groups: Sequence[Group], ready: Ready, settings: PlanSettings) -> Figure:
+    wanted: dict[str, tuple[float, str] | None] = {
+        "working_point": (settings.wanted_mm, f"wanted, {settings.wanted_mm:g} mm"),
+        "rotation": None
+        if settings.wanted_deg is None
+        else (settings.wanted_deg, f"wanted, {settings.wanted_deg:g} deg"),
+    }
+    rows = []
     for view in ready.cameras:
         own = [group for group in groups if group.keys["cameras"] == view]
-        for measure, level in (
-            ("working_point", (settings.wanted_mm, f"wanted, {settings.wanted_mm:g} mm")),
-            (
-                "rotation",
-                None if settings.wanted_deg is None else (settings.wanted_deg, f"{settings.wanted_deg:g} deg"),
-            ),
-        ):
+        for measure, level in wanted.items():
             curves = method_curves(own, measure, "motions", ready.methods)
-            panels.append(Panel(view, "motions", axis_label(measure), True, curves, level))
-    rows = tuple((panel,) for panel in panels)
+            if view == ready.cameras[0]:
+                curves += (_share_curve(table, measure, ready, settings),)
+            rows.append((Panel(view, "motions", axis_label(measure), True, curves, level),))
     caption = (
         f"Medians and quartiles of {settings.n_trials} trials of random motions, laparoscope "
-        f"{'moving' if settings.laparoscope == 'moves' else 'still'}. The bound is the median error of an unbiased "
-        "estimate that attains the Cramér-Rao bound."
+        f"{'moving' if settings.laparoscope == 'moves' else 'still'}. Dash-dotted: what decides, the error below which "
+        f"{100 * settings.confidence:g} % of them are ({ready.methods[0].title}). The bound is the median error of an "
+        "unbiased estimate that attains the Cramér-Rao bound."
     )
-    return Figure(FIGURE, TITLE, caption, rows)
+    return Figure(FIGURE, TITLE, caption, tuple(rows))
+
+
+def _share_curve(table: "pyarrow.Table", measure: str, ready: Ready, settings: PlanSettings) -> Series:
+    """The error that the wanted share of recordings does not exceed."""
+    counts = sorted(set(table.column("motions").to_pylist()))
+    reached = [_reached(table, motions, ready, settings) for motions in counts]
+    errors = tuple(mm if measure == "working_point" else deg for mm, deg in reached)
+    name = f"{100 * settings.confidence:g} % of recordings are below"
+    notes = tuple(f"{motions} motions" for motions in counts)
+    return Series(name, Style(3, is_bound=True), tuple(map(float, counts)), errors, errors, errors, notes)
 
 
 def _table(table: "pyarrow.Table", groups: Sequence[Group], ready: Ready, settings: PlanSettings) -> Table:

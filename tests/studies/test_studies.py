@@ -286,6 +286,8 @@ def test_the_plan_finds_the_number_of_motions(tmp_path) -> None:
         192,
         200,
     }
+    decides = next(c for c in result.figures[0].rows[0][0].series if c.name == "90 % of recordings are below")
+    assert decides.middle == pytest.approx([10.0 / np.sqrt(n) for n in decides.x])
     result = rc.study_plan(tmp_path / "out", replace(settings, wanted_mm=0.5))
     assert not result.reached
     assert "200 motions are not enough for 0.5 mm" in result.sentences[0]
