@@ -29,6 +29,8 @@ FRUSTUM_MM = 20.0
 SIGMAS = 3.0
 """Half axes of the ellipsoid, in sigmas."""
 PLAY_HZ = 10.0
+_BACK = 1.6
+"""Distance of the first view, in sizes of what it shows: the controls cover a quarter of a window."""
 
 
 @dataclass(frozen=True)
@@ -242,14 +244,14 @@ class Viewer:
 
     def _look_at_work(self) -> None:
         """First view: from the side, with the shaft and the cameras in the middle."""
-        middle = self._arms.end.mean(0)
+        middle = 0.5 * (self._arms.end.mean(0) + self._arms.rcm.mean(0))
         others = [shown.cameras.base_T_camera["right"][:, :3, 3].mean(0) for shown in self._shown.values()]
         size = max(
             [float(np.linalg.norm(self._arms.rcm.mean(0) - middle)), *(np.linalg.norm(o - middle) for o in others)]
         )
         camera = self._server.initial_camera
         camera.look_at = tuple(middle)
-        camera.position = tuple(middle + size * np.array([1.0, -1.0, 0.6]))
+        camera.position = tuple(middle + _BACK * size * np.array([1.0, -1.0, 0.6]))
 
 
 def open_viewer(

@@ -65,7 +65,7 @@ def test_the_scene_turns_and_steps_and_a_picture_opens(pages: dict[str, tuple[Pa
         "for (const [name, x] of [['pointerdown', 100], ['pointermove', 300], ['pointerup', 300]])"
         " s.dispatchEvent(new PointerEvent(name, {pointerId: 1, clientX: x, clientY: 200, isPrimary: true}));"
         "const m = document.getElementById('scene-motion'); m.value = 7; m.dispatchEvent(new Event('input'));"
-        "document.querySelectorAll('button.open')[1].click();"
+        "document.querySelectorAll('button.enlarge')[1].click();"
         "document.querySelector('[data-zoom=in]').click(); document.querySelector('[data-zoom=lines]').click();"
     )
     dom = page_that(tmp_path, page, script)

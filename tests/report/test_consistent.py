@@ -26,7 +26,8 @@ def test_counts_are_the_same_everywhere(pages: dict[str, tuple[Path, str]], name
 
 def test_a_refused_report_marks_nothing_as_used(pages: dict[str, tuple[Path, str]]) -> None:
     page = pages["refused_run"][1]
-    assert "strip ok" not in page and "bar used ok" not in page
+    assert "strip ok" not in page and "bar used ok" not in page and '<div class="strip open"' in page
+    assert not re.search(r"(^|[\s}])\.open \{[^}]*background", page)  # which would hide the strip's bars
     assert not re.search(r"\bused\b", words_of(page))
     assert "4 of 20 motions were usable; no estimate was made" in words_of(page)
     assert "usable, but there are too few" not in words_of(page)  # no reason of rejection

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from rmis_calib.geometry.rigid import transform_points
 from rmis_calib.pipeline.result import TOO_FEW
 from rmis_calib.pipeline.run import CalibrationRun
+from rmis_calib.vision import FrameReason
 
 _APART = 0.1
 """Least distance of two of the worst motions, as a part of the spread of all: neighbours have the same cause."""
@@ -45,7 +46,7 @@ def choose_motions(run: CalibrationRun, worst: int, typical: int, rejected_each:
     rejected = {
         reason: farthest_apart(np.flatnonzero(~used & (reasons == reason)), place, rejected_each)
         for reason, _ in counts
-        if reason != TOO_FEW
+        if reason not in (TOO_FEW, FrameReason.LEFT_OUT.sentence)
     }
     return ShownMotions(bad, usual, {reason: shown for reason, shown in rejected.items() if shown})
 

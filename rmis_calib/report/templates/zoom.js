@@ -3,7 +3,7 @@
   "use strict";
   const dialog = document.getElementById("zoom");
   const view = dialog.querySelector(".zoom-view"), words = dialog.querySelector(".zoom-words");
-  const pictures = [...document.querySelectorAll("button.open")];
+  const pictures = [...document.querySelectorAll("button.enlarge")];
   const fingers = new Map();
   let number = 0, svg = null, whole = null, box = null, apart = 0;
 
