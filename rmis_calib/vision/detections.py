@@ -10,6 +10,9 @@ from torch import Tensor
 # Score, as a fraction of the picture's width, from which a strip may be a shaft that this view does not show well: in
 # pictures of the plain presets what lies beside the shafts scores less in nine of ten, in `hard` missed shafts do not.
 _LEAD = 0.04
+CLOSED_CONFIDENCE = 0.45
+"""Most of a dark thing that something brighter closes before the border: tape, a square; or tissue over a shaft. Beside
+a sure shaft it is not worth a second look, which found nothing more in `brutal` and the real frames."""
 
 
 class FrameReason(IntEnum):
@@ -120,7 +123,7 @@ class ShaftDetections:
 
 
 def needs_second_pass(found: ShaftDetections, leads: Float[Tensor, "b k"], sure: float) -> Bool[Tensor, " b"]:
-    """Pictures without a sure shaft, with one that is not sure, or with more that looks like one.
+    """Pictures without a sure shaft, with a doubtful one, or with more that looks like one.
 
     Args:
         found: in one view.
@@ -130,7 +133,8 @@ def needs_second_pass(found: ShaftDetections, leads: Float[Tensor, "b k"], sure:
     is_sure = found.valid & (found.confidence >= sure)
     count = is_sure.sum(1, keepdim=True)
     beyond = torch.arange(leads.shape[1], device=leads.device) >= count
-    return (count[:, 0] == 0) | (found.valid & ~is_sure).any(1) | (beyond & (leads > _LEAD)).any(1)
+    doubtful = found.valid & ~is_sure & (found.confidence > CLOSED_CONFIDENCE)
+    return (count[:, 0] == 0) | doubtful.any(1) | (beyond & (leads > _LEAD)).any(1)
 
 
 def merge(first: ShaftDetections, second: ShaftDetections, sure: float) -> ShaftDetections:

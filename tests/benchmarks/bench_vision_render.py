@@ -14,6 +14,7 @@ the peers, of the medians of the error on the frames that both found; peers that
 left out. A peer may find any of the shafts in the picture.
 
 Three more tables: how far the confidence can be believed, what strong barrel distortion costs, and the goals.
+`--benches 60` instead counts shafts and what is none on laboratory benches: chessboards, cases, rulers, cables, print.
 Frames are streamed: memory does not depend on their number. `--keep` leaves the recordings for the next run.
 """
 
@@ -29,9 +30,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from bench_vision_real_frames import SURE, distances_px
 from vision_peers import PEERS, best_threshold, dark_mask, undistort
 
-from data_synth import load_synth_config, write_recording
+from data_synth import load_synth_config, render_bench, write_recording
 from data_synth.settings import SynthConfig
 from rmis_calib.geometry import Camera
 from rmis_calib.io import load_recording
@@ -298,6 +300,21 @@ def print_goals(ours: dict[str, Tally]) -> None:
         print(f"| {preset} | {' | '.join(cells)} | {'yes' if met else 'no'} |")
 
 
+def print_benches(count: int) -> None:
+    """Shafts found on benches, within 4 px of either contour, and candidates that lie on none."""
+    images, truth = render_bench(777001, count)
+    detector, visible, found, false, sure = ShaftDetector(), 0, 0, 0, 0
+    for i, shafts in enumerate(truth):
+        seen = detector.detect(images[i : i + 1])
+        ranks, used = set(seen.valid[0].nonzero()[:, 0].tolist()), set()
+        for shaft in (s for s in shafts if s.visible):
+            on = {k for k in ranks if distances_px(seen, k, shaft.contour_uv).max() < 4.0}
+            visible, found, used = visible + 1, found + bool(on), used | on
+        false += len(ranks - used)
+        sure += sum(float(seen.confidence[0, k]) > SURE for k in ranks - used)
+    print(f"{count} benches: {found} of {visible} shafts found, {false} false candidates, {sure} of them above {SURE}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=200)
@@ -305,9 +322,12 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, help="folder for the recordings, used again by the next run")
     parser.add_argument("--no-barrel", action="store_true", help="leave out the comparison of lenses")
     parser.add_argument("--no-peers", action="store_true", help="this detector alone")
+    parser.add_argument("--benches", type=int, help="benches with clutter, instead of the presets")
     options = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
+    if options.benches:
+        return print_benches(options.benches)
     print(f"{options.frames} frames a preset, torch {torch.__version__}, OpenCV {cv2.__version__}\n")
     print("| " + " | ".join(HEADER) + " |\n|" + " --- |" * len(HEADER), flush=True)
     ours: dict[str, Tally] = {}

@@ -13,7 +13,7 @@ from data_synth.truth import side_truth
 from data_synth.world import build_world
 from rmis_calib.geometry import Camera
 from rmis_calib.vision import DetectorSettings, FrameReason, ShaftDetections, ShaftDetector
-from rmis_calib.vision.detections import merge, needs_second_pass
+from rmis_calib.vision.detections import CLOSED_CONFIDENCE, merge, needs_second_pass
 
 SURE = 0.9
 
@@ -53,6 +53,8 @@ def shafts(*drawn: tuple[float, float, float]) -> ShaftDetections:
         (shafts((100, 0.99, 0), (300, 0.95, 0)), (0.3, 0.2, 0.01), False),
         (shafts(), (0.0, 0.0, 0.0), True),
         (shafts((100, 0.99, 0), (300, 0.95, 0), (500, 0.95, 0)), (0.3, 0.2, 0.1), False),
+        (shafts((100, 0.99, 0), (300, CLOSED_CONFIDENCE, 0)), (0.3, 0.02, 0.0), False),
+        (shafts((300, CLOSED_CONFIDENCE, 0)), (0.3, 0.0, 0.0), True),
     ],
 )
 def test_pictures_are_looked_at_again_where_something_is_left(

@@ -5,6 +5,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rmis_calib.vision.coarse.trace import Trace
+from rmis_calib.vision.detections import CLOSED_CONFIDENCE
 from rmis_calib.vision.image.line_fit import LineFit
 
 # Fitted as tests/benchmarks/fit_confidence.py does, on eleven presets (seeds 1001 to 1006, ten frames each) and the
@@ -16,8 +17,6 @@ _WEIGHTS = (-2.99, 1.04, 0.96, 3.61, 1.21, -3.3)
 _LEAST_PLAUSIBILITY = 0.3
 # Of 168 candidates below this evenness 14 are right, and those have no tissue beside them.
 _EVEN, _UNEVEN_PROBABILITY = 0.4, 0.6
-_CLOSED_PROBABILITY = 0.45
-"""Most for a dark thing that something brighter closes before the border: tape, a square; or tissue over a shaft."""
 _WANDER_FLOOR = 0.003
 """Share of the width below which less wander makes no shaft more certain."""
 
@@ -56,7 +55,7 @@ def capped(certain: Float[Tensor, "b k"], trace: Trace) -> Float[Tensor, "b k"]:
     """The probability, limited where only one side is tissue: half of a shaft, between a contour and a stripe of glare,
     is as straight as the whole; and where the dark thing does not come from the border."""
     certain = torch.where(trace.evenness < _EVEN, certain.clamp(max=_UNEVEN_PROBABILITY), certain)
-    return torch.where(trace.closed, certain.clamp(max=_CLOSED_PROBABILITY), certain)
+    return torch.where(trace.closed, certain.clamp(max=CLOSED_CONFIDENCE), certain)
 
 
 def plausible(trace: Trace, fit: LineFit, share: Float[Tensor, "b k"], reach_px: float) -> Bool[Tensor, "b k"]:
