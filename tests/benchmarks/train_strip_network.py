@@ -10,7 +10,8 @@ not those of the presets' benchmarks. Prints what the network says of pictures t
 The weights in the package come from a short run: 36 worlds and 1,190 benches, 14 minutes on a shared core, then four
 more passes in two orders whose weights were averaged. Whether a strip is a shaft they tell on rendered pictures only
 (94 % of the right ones taken, 2 % of the wrong); on real ones half of the shafts fell below the threshold. So the
-detector asks them where a shaft ends, and only where they recognise one.
+detector asks them where a shaft ends, and only where they recognise one. A network for the ends alone, trained on
+4,656 true strips of 1,200 such pictures for 2,500 steps, lost: 65 of 99 real ends within 2 px where these find 75.
 """
 
 import argparse
