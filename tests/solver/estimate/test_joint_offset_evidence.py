@@ -39,7 +39,7 @@ def test_data_tell_a_robot_with_offsets_from_one_without(size_deg):
     deg, mm = np.deg2rad(size_deg), 2.0 * size_deg
     recorded, _ = record(3, 200, 4, offset=[deg, -deg, mm, -deg, deg, -mm])
     kinematics = lambda joints, clock: recorded.kinematics(joints, clock).only("contours", "ends")  # noqa: E731
-    start = kinematics(torch.zeros(3, 6, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    start = kinematics(torch.zeros(3, 6, dtype=torch.float64), torch.zeros(3, 2, dtype=torch.float64))
     odds = solve(start, SolverSettings(unknowns=OFFSETS), kinematics=kinematics).nuisances["joint_offset"]
     assert bool(odds.log_odds_nominal.median() < -2.0 if size_deg else odds.log_odds_nominal.min() > 1.0)
 
