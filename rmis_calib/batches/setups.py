@@ -17,6 +17,7 @@ from rmis_calib.batches.pooling import (
     own_covariances,
     pool,
 )
+from rmis_calib.errors import InputError
 from rmis_calib.results import JOINT_OFFSET, CalibrationResult
 
 LEAST_FOR_DRIFT = 4
@@ -113,11 +114,15 @@ def compare(results: Sequence[CalibrationResult], names: Sequence[str], setup: s
         results: in the order of their time; those without transform and covariance do not count.
         names: of each.
         setup: what to call the set-up.
+
+    Raises:
+        InputError: recordings were told different diameters of the shaft, whose deviation is pooled too.
     """
     pairs = [(name, result) for name, result in zip(names, results, strict=True) if can_be_pooled(result)]
     kept_names, kept = tuple(name for name, _ in pairs), tuple(result for _, result in pairs)
     if not kept:
         return SetupComparison(setup, (), (), None, (), (), ())
+    _check_one_diameter(kept_names, kept)
     whole = pool(kept, drop_outliers=False)
     found: list[Change] = []
     pooled = whole
@@ -128,6 +133,32 @@ def compare(results: Sequence[CalibrationResult], names: Sequence[str], setup: s
     edges = [0, *(change.index for change in found), len(kept)]
     segments = tuple(pool(kept[a:b]) for a, b in pairwise(edges)) if found else (pooled,)
     return SetupComparison(setup, kept_names, kept, pooled, tuple(found), segments, _drifts(kept))
+
+
+def told_diameter_mm(result: CalibrationResult) -> float | None:
+    """Diameter of the shaft that the recording was told, from the prior of its radius; None where it was no unknown."""
+    shared, unknowns = result.information, result.config.get("solver", {}).get("unknowns", {})
+    relative = unknowns.get("radius_sigma_relative")
+    if shared is None or "radius" not in shared.shared_names or not relative:
+        return None
+    return 2.0 * float(shared.shared_prior_sigma[shared.shared_names.index("radius")]) / relative
+
+
+def _check_one_diameter(names: Sequence[str], results: Sequence[CalibrationResult]) -> None:
+    """Refuse results of shafts of different diameters.
+
+    Raises:
+        InputError: names one result of each diameter.
+    """
+    told: dict[float, str] = {}
+    for name, result in zip(names, results, strict=True):
+        diameter_mm = told_diameter_mm(result)
+        if diameter_mm is not None:
+            told.setdefault(round(diameter_mm, 6), name)
+    if len(told) > 1:
+        found = ", ".join(f"{diameter_mm:g} mm ({name})" for diameter_mm, name in told.items())
+        expected = "results of one shaft_diameter_mm (compare those of each diameter by themselves)"
+        raise InputError(where="compare", expected=expected, found=found)
 
 
 def _drifts(results: Sequence[CalibrationResult]) -> tuple[Drift, ...]:

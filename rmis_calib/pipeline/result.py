@@ -20,6 +20,7 @@ from rmis_calib.results import (
     STATUS_SENTENCES,
     CalibrationResult,
     Change,
+    ClockJump,
     Consistency,
     GroupShift,
     Information,
@@ -133,6 +134,12 @@ def judge(solution: Solution) -> tuple[Status, str]:
         return "solver_failed", f"{why}; {strange}" if strange else why
     if strange:
         return "weak", f"{STATUS_SENTENCES['weak']}: {strange}"
+    jump = solution.clock_jump
+    if jump is not None and bool(jump.is_clear):
+        return "weak", (
+            f"Pictures and joints lose each other: the clock jumps by {float(jump.jump_s):+.3f} s before motion "
+            f"{int(jump.at)}. Likely: frames or samples were lost there; then: the frame rate, or the camera moved"
+        )
     if solution.groups is not None and bool(solution.groups.contradicts):
         return "weak", f"Parts of the data contradict each other: {_contradiction(solution.groups)}"
     name: Status = "ok" if verdict is Verdict.TRUSTWORTHY else verdict.value
@@ -223,7 +230,7 @@ def _nuisances(solution: Solution, joint_columns: tuple[str, ...]) -> dict[str, 
 
 def consistency_of(solution: Solution) -> Consistency | None:
     """Groups of neighbouring motions and halves against each other; None without groups."""
-    groups = solution.groups
+    groups, jump = solution.groups, solution.clock_jump
     if groups is None or groups.count == 0 or bool((groups.group < 0).all()):
         return None
     numbers = groups.group.reshape(-1).cpu().numpy()
@@ -238,6 +245,7 @@ def consistency_of(solution: Solution) -> Consistency | None:
         groups=tuple(without),
         halves=Shift(*_size(groups.halves[0]), float(groups.halves_sigmas)),
         change=Change(*_size(groups.change[0]), float(groups.change_sigmas), before_motion=int(groups.change_at)),
+        clock_jump=None if jump is None else ClockJump(float(jump.jump_s), float(jump.sigmas), int(jump.at)),
     )
 
 

@@ -1,4 +1,5 @@
 from .parts import Change as Change
+from .parts import ClockJump as ClockJump
 from .parts import Consistency as Consistency
 from .parts import GroupShift as GroupShift
 from .parts import HeadPointError as HeadPointError

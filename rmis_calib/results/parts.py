@@ -113,6 +113,18 @@ class Change(Shift):
     """Index of the first motion after the change."""
 
 
+@dataclass(frozen=True, config=FILE_PART)
+class ClockJump:
+    """The clearest jump of the clock between video and joints."""
+
+    jump_s: Number
+    """Size of the jump in seconds: joints are read so much later after it."""
+    sigmas: Number
+    """Size of the jump in its own sigmas."""
+    before_motion: int
+    """Index of the first motion after the jump."""
+
+
 @dataclass(frozen=True, eq=False, config=FILE_PART)
 class Consistency:
     """Whether parts of the data agree."""
@@ -127,6 +139,12 @@ class Consistency:
     """Difference of the answers from two halves of the motions that are far from each other in joint space."""
     change: Change
     """The clearest difference between what comes before and after one motion."""
+    clock_jump: ClockJump | None = None
+    """The clearest jump of the clock; absent where the clock is no unknown."""
+
+    @model_serializer(mode="wrap")
+    def _without_absent(self, plain):
+        return {key: value for key, value in plain(self).items() if key != "clock_jump" or value is not None}
 
 
 @dataclass(frozen=True, eq=False, config=FILE_PART)

@@ -287,7 +287,7 @@ def _shaped(solution: Solution, batch: torch.Size) -> Solution:
     def shaped(value: Tensor) -> Tensor:
         return value.clone().reshape((*batch, *value.shape[1:]))
 
-    flat = ("observability", "posterior", "groups", "history")
+    flat = ("observability", "posterior", "groups", "clock_jump", "history")
     return replace(
         solution,
         **{name: map_tensors(item, torch.clone if name in flat else shaped) for name, item in vars(solution).items()},

@@ -77,6 +77,9 @@ class Posterior:
 
 HALVES_APART = 4.49
 """Distance of two halves in their sigmas, the 3-sigma bound of 6 unknowns, beyond which they contradict each other."""
+JUMPED = 4.5
+"""Size of a jump of the clock in its sigmas that chance makes at one of 32 borders in fewer than 3 of 10,000
+recordings."""
 CHANGED = 5.5
 """Distance of before and after in their sigmas that chance makes in fewer than 3 of 10,000 recordings of 8 blocks."""
 
@@ -139,6 +142,26 @@ class GroupCheck:
 
 
 @dataclass(frozen=True)
+class ClockJump:
+    """The clearest step of the clock's offset in time, flat over trials.
+
+    Attributes:
+        jump_s: added to the times at which the joints are read, from the motion `at` on.
+        sigmas: the same in its own sigmas.
+        at: number of the first motion after it.
+    """
+
+    jump_s: Float[Tensor, " b"]
+    sigmas: Float[Tensor, " b"]
+    at: Int[Tensor, " b"]
+
+    @property
+    def is_clear(self) -> Bool[Tensor, " b"]:
+        """Whether the clock jumps there."""
+        return self.sigmas > JUMPED
+
+
+@dataclass(frozen=True)
 class Solution:
     """Estimates for every trial of the batch.
 
@@ -164,6 +187,7 @@ class Solution:
         observability: what the data can see, flat over trials; its `describe(trial)` puts one trial into words.
         posterior: what further motions would add to (assess/information.py); None for methods that estimate no noise.
         groups: what leaving out groups of neighbouring motions says, flat over trials; None for `paper` and `global`.
+        clock_jump: the clearest jump of the clock, flat over trials; None where the clock is no unknown.
         history: cost of accepted iterates of the refinement.
         frame: what `arm` is: `arm`, the laparoscope's; or `instrument_base` where the set-up is unknown and the
             laparoscope stands still: the pose of the instrument's base in the camera is then all there is to know.
@@ -194,6 +218,7 @@ class Solution:
     ends_elsewhere: Int[Tensor, "*batch"] | None = None
     posterior: Posterior | None = None
     groups: GroupCheck | None = None
+    clock_jump: ClockJump | None = None
     history: tuple[Float[Tensor, "..."], ...] = ()
     frame: str = "arm"
     setup: SetupEstimate | None = None
@@ -217,6 +242,9 @@ class Solution:
         if self.groups is not None:
             not_above = verdict.clamp_min(Verdict.WEAK.code)
             verdict = torch.where(self.groups.contradicts.view_as(verdict), not_above, verdict)
+        if self.clock_jump is not None:
+            not_above = verdict.clamp_min(Verdict.WEAK.code)
+            verdict = torch.where(self.clock_jump.is_clear.view_as(verdict), not_above, verdict)
         return torch.where(self.converged, verdict, Verdict.UNOBSERVABLE.code)
 
     @property

@@ -13,7 +13,7 @@ import rmis_calib as rc
 from rmis_calib.batches import JobRecord
 from rmis_calib.batches.pooling import changes, drift, pool
 from rmis_calib.batches.run import setups_of
-from rmis_calib.batches.setups import compare
+from rmis_calib.batches.setups import compare, told_diameter_mm
 from rmis_calib.batches.task import setup_of
 from rmis_calib.errors import InputError
 from rmis_calib.io import read_description
@@ -103,6 +103,20 @@ def test_results_of_one_set_up_agree_and_pool_to_the_truth(series) -> None:
     assert "agree within their sigmas" in compared.sentences()[0]
     assert distance2(tangent(pooled.camera_right_T_arm, truth), pooled.covariance) < chi2.ppf(0.999, 6)
     assert pooled.translation_sigma_mm < results[0].translation_sigma_mm
+
+
+def test_results_of_other_shafts_are_not_compared(observed, solved) -> None:
+    """Their radii deviate from different ones; a result of before the radius was told does not matter."""
+    seen, _ = observed(30, 0)
+    assert seen.shaft_radius_mm is not None
+    wider = solved(replace(seen, shaft_radius_mm=seen.shaft_radius_mm + 0.25))
+    first = solved(seen)
+    assert told_diameter_mm(first) == pytest.approx(2.0 * seen.shaft_radius_mm)
+    assert told_diameter_mm(wider) == pytest.approx(2.0 * seen.shaft_radius_mm + 0.5)
+    with pytest.raises(InputError, match=r"one shaft_diameter_mm .*mm \(a\), .*mm \(b\)"):
+        compare([first, wider], ["a", "b"])
+    assert told_diameter_mm(replace(wider, information=None)) is None
+    compare([first, replace(wider, information=None)], ["a", "b"])
 
 
 def test_one_that_does_not_fit_is_named_and_left_out(series, moved) -> None:

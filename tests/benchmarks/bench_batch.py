@@ -1,6 +1,6 @@
 """A batch of 50 recordings that end in every way: outcomes, speed, memory, kills; and the page of 1,000 recordings.
 
-    python tests/benchmarks/bench_batch.py [--kills 20] [--keep FOLDER]
+    python tests/benchmarks/bench_batch.py [--kills 20] [--only-kills] [--keep FOLDER]
 
 Prints one line a measurement. Each part makes its own outputs; nothing is read but what is rendered here.
 """
@@ -180,7 +180,7 @@ def kills(root: Path, work: Path, whole: Path, count: int, took_s: float) -> Non
     """Batches killed at random moments: the parent, a worker or both; then resumed to the end."""
     moments = random.Random(0)
     same = 0
-    for _ in range(count):
+    for done in range(1, count + 1):
         out = work / "killed"
         shutil.rmtree(out, ignore_errors=True)
         rounds = 0
@@ -203,6 +203,7 @@ def kills(root: Path, work: Path, whole: Path, count: int, took_s: float) -> Non
                     kill(process.pid)
                 process.wait()
         same += without_times(out) == without_times(whole)
+        print(f"  {same} of {done} so far, {rounds} starts for the last", flush=True)
     print(f"killed at random moments: {same} of {count} batches ended in the summary of the one that was not killed")
 
 
@@ -249,11 +250,27 @@ def page_of_many(out: Path, work: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--only-kills", action="store_true", help="nothing but the killed batches of four recordings")
     parser.add_argument("--keep", type=Path)
     arguments = parser.parse_args()
     work = arguments.keep or Path(tempfile.mkdtemp(prefix="bench_batch_"))
     work.mkdir(parents=True, exist_ok=True)
     bases = render(work / "bases")
+    if not arguments.only_kills:
+        whole_zoo(bases, work)
+    few = work / "few"
+    for i in range(3):
+        shutil.copytree(bases["good"], few / f"case_{i}")
+    (few / "cut").mkdir()
+    shutil.copy(bases["good"] / "recording.yaml", few / "cut")
+    took, _ = run(few, work / "few_whole", "--workers", "2")
+    kills(few, work, work / "few_whole", arguments.kills, took)
+    if arguments.keep is None:
+        shutil.rmtree(work)
+
+
+def whole_zoo(bases: dict[str, Path], work: Path) -> None:
+    """Speed, then 50 recordings of every outcome, and the page of 1,000."""
     throughput(bases, work)
     expected = zoo(work / "zoo", bases)
     took, code = run(work / "zoo", work / "out", "--workers", "2", "--memory-gb", "2.5")
@@ -263,14 +280,6 @@ def main() -> None:
     check_outcomes(work / "out", expected)
     overhead(work / "out")
     page_of_many(work / "out", work)
-    few = work / "few"
-    for i in range(3):
-        shutil.copytree(bases["good"], few / f"case_{i}")
-    shutil.copytree(work / "zoo" / "bad" / "cut_0", few / "cut")
-    took, _ = run(few, work / "few_whole", "--workers", "2")
-    kills(few, work, work / "few_whole", arguments.kills, took)
-    if arguments.keep is None:
-        shutil.rmtree(work)
 
 
 if __name__ == "__main__":

@@ -39,7 +39,8 @@ class Recorded:
         arrays: what the cameras measured, trials first.
         noise: (trials, n, 4, 4) noise of arm_T_rcm.
         offset: (6,) true minus read, laparoscope's joints first.
-        clock_s, rate: the time in the joint log is that of the frame + clock_s + rate times that from the middle.
+        clock_s, rate: the time in the joint log is that of the frame + clock_s (of all frames, or of each) + rate times
+            the time from the middle.
     """
 
     scene: Scene
@@ -47,7 +48,7 @@ class Recorded:
     arrays: dict
     noise: np.ndarray
     offset: np.ndarray
-    clock_s: float
+    clock_s: float | np.ndarray
     rate: float = 0.0
 
     def joints(self, times_s: np.ndarray) -> np.ndarray:
@@ -72,9 +73,9 @@ class Recorded:
         """What a pipeline hands to the solver: both arms at these offsets, with derivatives by central differences."""
         trials = self.noise.shape[0]
         b = joint_offset.shape[0]
-        offset_s, rate = (clock.numpy() - np.array([self.clock_s, self.rate])).T[..., None]
+        offset_s, rate = clock.numpy().T[..., None]
         from_middle = self.times_s - 0.5 * (self.times_s[0] + self.times_s[-1])
-        at = self.times_s + offset_s + rate * from_middle
+        at = self.times_s + (offset_s - self.clock_s) + (rate - self.rate) * from_middle
         q = self.joints(at) - self.offset + joint_offset.numpy()[:, None]
         centre = self.poses(q)
         derivative = [
@@ -124,7 +125,7 @@ class Recorded:
 
 
 def record(
-    trials: int, n: int, seed: int, offset=None, clock_s: float = 0.0, stereo=(0.0, 0.0), rate: float = 0.0
+    trials: int, n: int, seed: int, offset=None, clock_s: float | np.ndarray = 0.0, stereo=(0.0, 0.0), rate: float = 0.0
 ) -> tuple[Recorded, torch.Tensor]:
     """A recording and its true transform."""
     settings: LineStudyConfig = config(REALISTIC, trials, seed)

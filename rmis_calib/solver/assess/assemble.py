@@ -8,6 +8,7 @@ from torch import Tensor
 
 from rmis_calib.geometry.rigid import rigid_exp, rigid_from_rotation_translation, rigid_inverse, rigid_log
 from rmis_calib.geometry.rotations import matrix_to_rotvec
+from rmis_calib.solver.assess.clock_jump import find_clock_jump
 from rmis_calib.solver.assess.groups import check_groups
 from rmis_calib.solver.assess.observability import assess, detect_degeneracies, turns_about_one_axis
 from rmis_calib.solver.estimate.map_estimate import MapEstimate
@@ -111,6 +112,7 @@ def joint_solution(fit: MapEstimate, settings: SolverSettings, alternative: Alte
     C = C * excess.clamp_min(1.0)[:, None, None]  # too small noise levels would make sigma too small (Birge 1932)
     groups = check_groups(fit, settings.groups)
     C = groups.grown(C)
+    jump = find_clock_jump(fit, excess, groups)
     setup = _setup(fit, excess, groups)
     if alternative is not None:
         C = _mixed(C, state.R, state.t, alternative)
@@ -133,6 +135,7 @@ def joint_solution(fit: MapEstimate, settings: SolverSettings, alternative: Alte
         nuisances=_nuisances(fit, settings),
         bias=fit.bias[:, :6],
         groups=groups,
+        clock_jump=jump,
         setup=setup,
         history=fit.history,
         observability=_observability(fit.problem, state.R, state.t, C, fit.model.noise, uses, settings),

@@ -61,12 +61,12 @@ def check_groups(fit: MapEstimate, asked: int) -> GroupCheck:
     group = neighbours(place, used, count)
     block = torch.arange(measured.motions, device=group.device) * count // measured.motions
     in_time = membership(block.expand_as(group), count, state.t.dtype)
-    model, recounted = fit.model, _recounted(fit, in_time[0])
+    model, in_full = fit.model, recounted(fit, in_time[0])
     H_all, s_all = _sums(model, state, torch.cat((membership(group, count, state.t.dtype), in_time), dim=-1))
     H_k, s_k = H_all[:, :count], s_all[:, :count]
     prior = fit.model.layout.sigma.square().reciprocal()
     deviation, _ = model.layout.prior(state)
-    H_t, s_t = (H_all[:, count:], s_all[:, count:]) if recounted is model else _sums(recounted, state, in_time)
+    H_t, s_t = (H_all[:, count:], s_all[:, count:]) if in_full is model else _sums(in_full, state, in_time)
     s_k = s_k - (s_k.sum(1) + prior * deviation)[:, None] / count  # what the bias correction left of the score
     H = H_k.sum(1) + torch.diag_embed(prior)
     rest = inverse(H[:, None] - H_k)
@@ -100,7 +100,7 @@ def check_groups(fit: MapEstimate, asked: int) -> GroupCheck:
         halves_sigmas=torch.where(enough, apart[:, 0], 0.0),
         change=torch.take_along_dim(changes, clearest[:, None, None], dim=1)[:, 0],
         change_sigmas=torch.where(enough, change_apart.amax(-1), 0.0),
-        change_at=_first_of_block(measured.motions, count, clearest + 1),
+        change_at=first_of_block(measured.motions, count, clearest + 1),
         inflation=factor.mean(-1).sqrt(),
     )
 
@@ -180,7 +180,7 @@ def _first_half(place: Float[Tensor, "b n d"], group: Int[Tensor, "b n"], count:
     return torch.zeros_like(is_first).scatter(-1, order, is_first).to(place.dtype)
 
 
-def _recounted(fit: MapEstimate, block: Float[Tensor, "n k"]) -> WeightedModel:
+def recounted(fit: MapEstimate, block: Float[Tensor, "n k"]) -> WeightedModel:
     """The model for the comparison of blocks in time. Where most motions of a block were rejected they count in full: a
     camera that was knocked looks like a block of outliers."""
     if fit.model.weight is None:
@@ -191,7 +191,7 @@ def _recounted(fit: MapEstimate, block: Float[Tensor, "n k"]) -> WeightedModel:
     return replace(fit.model, weight=torch.where(mostly, 1.0, weight))
 
 
-def _first_of_block(motions: int, count: int, block: Int[Tensor, " b"]) -> Int[Tensor, " b"]:
+def first_of_block(motions: int, count: int, block: Int[Tensor, " b"]) -> Int[Tensor, " b"]:
     """Number of the first motion of one of `count` consecutive blocks."""
     return (block * motions + count - 1) // count
 
