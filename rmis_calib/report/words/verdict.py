@@ -95,7 +95,7 @@ def _error_checks(result: CalibrationResult) -> list[Check]:
     ):
         size, limit = finite(value), finite(limits.get(f"trustworthy_{unit}") if isinstance(limits, Mapping) else None)
         if size is not None and limit is not None:
-            words = f"{what}: {significant(size, 2)} {unit}, to be below {limit:g} {unit} (1 σ)"
+            words = f"{what}: {significant(size, 2)} {unit}, 1 σ (limit {limit:g})"
             found.append(Check(size < limit, words))
     return found
 
@@ -108,11 +108,11 @@ def _consistency_checks(result: CalibrationResult) -> list[Check]:
     found = []
     halves, change = finite(consistency.halves.sigmas), finite(consistency.change.sigmas)
     if halves is not None:
-        words = f"Two halves of the motions are {halves:.1f} of their sigmas apart, to be below {HALVES_APART:g}"
+        words = f"Two halves of the motions: {halves:.1f} of their sigmas apart (limit {HALVES_APART:g})"
         found.append(Check(halves <= HALVES_APART, words))
     if change is not None:
         words = (
-            f"Before and after motion {consistency.change.before_motion}: {change:.1f} sigmas, to be below {CHANGED:g}"
+            f"Before and after motion {consistency.change.before_motion}: {change:.1f} sigmas apart (limit {CHANGED:g})"
         )
         found.append(Check(change <= CHANGED, words))
     return found
