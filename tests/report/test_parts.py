@@ -133,6 +133,21 @@ def test_every_check_holds_for_a_trustworthy_result_and_one_fails_for_another(re
     ]
 
 
+def test_checks_name_the_part_of_the_data_that_disagrees(result_with) -> None:
+    shift = {"rotation_deg": 0.1, "translation_mm": 0.2, "sigmas": 1.5}
+    parts = {
+        "inflation": 1.0,
+        "group_by_motion": [0] * 60,
+        "groups": [shift | {"motions": 60}],
+        "halves": shift,
+        "change": shift | {"before_motion": 30},
+        "clock_jump": {"jump_s": 0.2, "sigmas": 9.0, "before_motion": 41},
+    }
+    found = verdict(result_with(status="weak", message="the clock jumps", consistency=parts)).checks
+    assert [check.passed for check in found] == [True, True, False]
+    assert found[-1].words == "Jump of the clock before motion 41: +0.200 s, 9.0 sigmas (limit 4.5)"
+
+
 def test_importing_the_package_loads_nothing_heavy_and_charts_do_not_load_pyplot() -> None:
     program = (
         "import sys, rmis_calib.report\n"

@@ -8,7 +8,7 @@ from rmis_calib.pipeline.result import JOINTS_UNKNOWN, TOO_FEW
 from rmis_calib.report.words.formatting import finite, significant
 from rmis_calib.results import STATUS_SENTENCES, CalibrationResult
 from rmis_calib.solver import MotionReason
-from rmis_calib.solver.solution import CHANGED, HALVES_APART
+from rmis_calib.solver.solution import CHANGED, HALVES_APART, JUMPED
 from rmis_calib.vision import FrameReason
 
 WORTH_MOVING = 0.95
@@ -115,6 +115,11 @@ def _consistency_checks(result: CalibrationResult) -> list[Check]:
             f"Before and after motion {consistency.change.before_motion}: {change:.1f} sigmas apart (limit {CHANGED:g})"
         )
         found.append(Check(change <= CHANGED, words))
+    jump = consistency.clock_jump
+    sigmas, jump_s = (None, None) if jump is None else (finite(jump.sigmas), finite(jump.jump_s))
+    if jump is not None and sigmas and jump_s:  # none where the clock could not be told
+        words = f"Jump of the clock before motion {jump.before_motion}: {jump_s:+.3f} s, {sigmas:.1f} sigmas"
+        found.append(Check(sigmas <= JUMPED, f"{words} (limit {JUMPED:g})"))
     return found
 
 
