@@ -269,7 +269,7 @@ def test_results_of_one_set_up_are_pooled_and_shown(demo_output, tmp_path, capsy
         (["batch", "nowhere", "--out", "out"], "nothing there"),
         (["batch", ".", "--out", "out", "--workers", "0"], "workers"),
         (["batch", ".", "--out", "out", "--task", "paint"], "detect"),
-        (["batch", "."], "--out"),
+        (["batch", "."], "expected a recording"),
         (["compare", "nowhere.json"], "nothing there"),
     ],
 )
