@@ -87,6 +87,7 @@ def _sigmas(config: LineStudyConfig) -> dict[str, float]:
     for source in ("kinematics", "camera", "stereo"):
         sigmas[f"sigma_{source}_mm"] = getattr(config, f"{source}_noise_mm")
         sigmas[f"sigma_{source}_rad"] = float(np.deg2rad(getattr(config, f"{source}_noise_deg")))
+    sigmas |= {"sigma_setup_mm": 0.0, "sigma_setup_rad": 0.0}
     return sigmas
 
 

@@ -89,8 +89,8 @@ class Robot:
     dh_convention: DhConvention
     arms: Mapping[str, Arm]
     setup_sigma_mm: float | None = None
-    """How well the bases are known: 1 sigma per axis of the pose of one arm's base in another's. None: exactly. With
-    it a calibration estimates that pose too, near to what `base_T_arm_base` says."""
+    """How well the bases are known: 1 sigma per axis of the pose of one arm's base in another's. Zero: exactly. More
+    than zero: a calibration estimates that pose too, near to what `base_T_arm_base` says. None: nobody states it."""
     setup_sigma_rad: float | None = None
     """The same of its orientation; both or neither."""
 

@@ -214,14 +214,16 @@ class RobotSchema(Schema):
     name: Annotated[str, StringConstraints(min_length=1)]
     dh_convention: DhConvention
     arms: Annotated[dict[Name, ArmSchema], Field(min_length=1)]
-    setup_sigma_mm: Annotated[float, Field(gt=0)] | None = None
-    setup_sigma_deg: Annotated[float, Field(gt=0, le=180)] | None = None
+    setup_sigma_mm: Annotated[float, Field(ge=0)] | None = None
+    setup_sigma_deg: Annotated[float, Field(ge=0, le=180)] | None = None
 
     @model_validator(mode="after")
     def _prior_of_stated_bases(self) -> "RobotSchema":
         if (self.setup_sigma_mm is None) != (self.setup_sigma_deg is None):
             present = "setup_sigma_mm" if self.setup_sigma_deg is None else "setup_sigma_deg"
             raise ValueError(f"expected both setup_sigma_mm and setup_sigma_deg or neither, found only {present}")
+        if ((self.setup_sigma_mm or 0.0) > 0) != ((self.setup_sigma_deg or 0.0) > 0):
+            raise ValueError("expected setup_sigma_mm and setup_sigma_deg both zero (exact) or both positive")
         unplaced = [name for name, arm in self.arms.items() if arm.base_T_arm_base is None]
         if self.setup_sigma_mm is not None and unplaced:
             raise ValueError(f"expected base_T_arm_base of {', '.join(unplaced)} beside setup_sigma_mm, found none")

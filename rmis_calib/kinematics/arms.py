@@ -64,7 +64,8 @@ class RobotKinematics:
         self.setup_is_stated = all(base is not None for base in bases)
         """Whether the robot tells where the bases of both arms are; else both are at the identity here."""
         self.setup_sigma = None
-        """1 sigma per axis (mm, rad) of the set-up that the robot states; None where it is exact, or none is stated."""
+        """1 sigma per axis (mm, rad) of the set-up that the robot states; zero where it is exact, None where nobody
+        states it."""
         if self.setup_is_stated and robot.setup_sigma_mm is not None and robot.setup_sigma_rad is not None:
             self.setup_sigma = (robot.setup_sigma_mm, robot.setup_sigma_rad)
         self._laparoscope = None

@@ -119,10 +119,10 @@ def calibrate_views(
 
 
 def _without_unknown_arm(recording: Recording, poses: MotionPoses) -> tuple[Recording, MotionPoses]:
-    """Without the laparoscope's arm where it stands still and nobody states exactly where the arms' bases are: the pose
-    of the instrument's base in the camera is then all that there is to know."""
-    exact = poses.setup_is_stated and poses.setup_sigma is None
-    if exact or poses.laparoscope_base_T_arm is None or not stands_still(poses.laparoscope_base_T_arm):
+    """Without the laparoscope's arm where it stands still, and where the arms' bases are is stated with a sigma or not
+    at all: the pose of the instrument's base in the camera is then all that there is to know."""
+    told = poses.setup_is_stated and not any(poses.setup_sigma or ())
+    if told or poses.laparoscope_base_T_arm is None or not stands_still(poses.laparoscope_base_T_arm):
         return recording, poses
     return replace(recording, laparoscope_arm=None, robot=recording.robot.without_bases()), poses.in_instrument_base()
 

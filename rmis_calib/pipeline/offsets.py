@@ -15,7 +15,7 @@ from rmis_calib.pipeline.offset_unknowns import NO_CLOCK, OffsetUnknowns, estima
 from rmis_calib.robot import split_joint_column
 from rmis_calib.solver import Problem, Solution
 from rmis_calib.solver import solve as solve_problem
-from rmis_calib.solver.estimate.evidence import CHANCE, freed
+from rmis_calib.solver.assess.evidence import CHANCE, freed
 from rmis_calib.solver.estimate.relinearise import scan_clock
 from rmis_calib.solver.own_measurement import Measurement
 from rmis_calib.solver.settings import SolverSettings
@@ -88,7 +88,10 @@ def estimate_with_kinematics(
     notes = (*about_clock, _about_offsets(offsets, unseen, moves, unknowns.columns, float(probability)))
     if asked.joint_offsets == "always" or bool(offsets.log_odds_nominal < -STRONG_EVIDENCE):
         return solution, notes
-    with_offsets = AlternativeModel(solution.camera_right_T_arm, solution.covariance, probability)
+    covariance = solution.covariance
+    if "setup" in solution.doubt:  # the last solve allows for it itself
+        covariance = covariance - solution.doubt["setup"]
+    with_offsets = AlternativeModel(solution.camera_right_T_arm, covariance, probability)
     return moving.solve(sigma * 0.0, with_offsets), notes
 
 

@@ -33,7 +33,7 @@ class MotionPoses:
             is no such arm.
         laparoscope_base_T_instrument_base: the set-up that `arm_T_rcm` was evaluated at.
         setup_is_stated: whether the robot tells it; else it was evaluated at the identity.
-        setup_sigma: how well it tells it, 1 sigma per axis in mm and rad; None: exactly.
+        setup_sigma: how well it tells it, 1 sigma per axis in mm and rad; zero: exactly; None: nobody states it.
     """
 
     frames: np.ndarray

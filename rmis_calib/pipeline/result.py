@@ -12,7 +12,7 @@ from rmis_calib.pipeline.association import Choice
 from rmis_calib.pipeline.detection import View
 from rmis_calib.pipeline.observations import reasons_for
 from rmis_calib.pipeline.poses import MotionPoses
-from rmis_calib.pipeline.setup_record import about_compliance, about_setup, given_way, setup_of
+from rmis_calib.pipeline.setup_record import about_compliance, about_setup, given_way, instrument_base_of, setup_of
 from rmis_calib.pipeline.words import ranges_in_words, words_of
 from rmis_calib.results import (
     INTRINSICS,
@@ -90,6 +90,7 @@ def make_result(
         nuisances=_nuisances(solution, joint_columns),
         consistency=consistency,
         setup=setup_of(solution),
+        instrument_base=instrument_base_of(solution),
         information=_information(solution),
         config=config.to_dict(),
     )

@@ -4,10 +4,9 @@ import numpy as np
 import torch
 
 from rmis_calib.geometry.rigid import RigidTransform
-from rmis_calib.results import INSTRUMENT_BASE, Setup
+from rmis_calib.results import INSTRUMENT_BASE, InstrumentBase, Setup
 from rmis_calib.solver import Solution
 from rmis_calib.solver.model.compliance import FUNCTIONS, MEAN_SQUARES, TURNS
-from rmis_calib.solver.observability import Degeneracy
 from rmis_calib.solver.solution import Nuisance
 
 
@@ -29,6 +28,21 @@ def setup_of(solution: Solution) -> Setup | None:
     )
 
 
+def instrument_base_of(solution: Solution) -> InstrumentBase | None:
+    """What a laparoscope that stands still tells whatever the set-up is."""
+    found = solution.instrument_base
+    if found is None or not bool(torch.isfinite(found.covariance).all()):
+        return None
+    matrix, covariance = found.camera_right_T_instrument_base.reshape(4, 4), found.covariance.reshape(6, 6)
+    variance = covariance.diagonal()
+    return InstrumentBase(
+        RigidTransform("camera_right", INSTRUMENT_BASE, matrix.detach().cpu()),
+        rotation_sigma_deg=float(torch.rad2deg(variance[:3].sum().sqrt())),
+        translation_sigma_mm=float(variance[3:].sum().sqrt()),
+        covariance=covariance.cpu().numpy(),
+    )
+
+
 def about_setup(solution: Solution, frame: str) -> tuple[str, ...]:
     """What became of the pose of one arm's base in the other's, in words."""
     if frame == INSTRUMENT_BASE:
@@ -39,12 +53,15 @@ def about_setup(solution: Solution, frame: str) -> tuple[str, ...]:
         )
     found = setup_of(solution)
     if found is None:
-        still = int(solution.observability.degeneracy.reshape(-1)[0]) & Degeneracy.STATIC_LAPAROSCOPE
-        if not still or "setup" not in solution.evidence:
+        base = instrument_base_of(solution)
+        if base is None:
             return ()
         return (
-            "The laparoscope did not move: no motion tells whether the arms' bases are where base_T_arm_base says, and "
-            "camera_right_T_arm is only as right as that.",
+            "The laparoscope did not move: what the data tell is camera_right_T_instrument_base, to "
+            f"{base.rotation_sigma_deg:.2g} deg, {base.translation_sigma_mm:.2g} mm (1 sigma; instrument_base in "
+            "result.json). camera_right_T_arm is only as right as base_T_arm_base: setup_sigma_mm and setup_sigma_deg "
+            "in robot.yaml say how well that is known (0: exactly); where they do not, its sigma allows for 2 mm and "
+            "0.5 deg.",
         )
     known = f"to {found.rotation_sigma_deg:.2g} deg, {found.translation_sigma_mm:.2g} mm (1 sigma)"
     if found.from_stated_mm is None:

@@ -4,6 +4,7 @@ from .parts import Consistency as Consistency
 from .parts import GroupShift as GroupShift
 from .parts import HeadPointError as HeadPointError
 from .parts import Information as Information
+from .parts import InstrumentBase as InstrumentBase
 from .parts import KinematicOffsets as KinematicOffsets
 from .parts import Motions as Motions
 from .parts import Nuisance as Nuisance

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from pydantic import Field, computed_field, model_serializer, model_validator
 from pydantic.dataclasses import dataclass
 
-from rmis_calib.io.plain_values import FILE_PART, Flags, Indices, Number, Square, Transform, Vector
+from rmis_calib.io.plain_values import FILE_PART, Covariance6, Flags, Indices, Number, Square, Transform, Vector
 
 
 @dataclass(frozen=True, eq=False, config=FILE_PART)
@@ -199,6 +199,21 @@ class Setup:
     covariance: Square
     """(12, 12) of `camera_right_T_arm`, then of this transform: each rotation first, R = exp(dphi) R^, t = t^ + dt; rad
     and mm."""
+
+
+@dataclass(frozen=True, eq=False, config=FILE_PART)
+class InstrumentBase:
+    """Where the instrument's base is in the camera, where the laparoscope stood still: the data tell that whatever
+    `base_T_arm_base` says, while `camera_right_T_arm` is only as right as that."""
+
+    camera_right_T_instrument_base: Transform
+    """The estimate, mm; it holds as long as the laparoscope stays there."""
+    rotation_sigma_deg: Number
+    """Root of the trace of its covariance's rotation block, degrees."""
+    translation_sigma_mm: Number
+    """Root of the trace of the translation block, mm."""
+    covariance: Covariance6
+    """(6, 6), rotation first, R = exp(dphi) R^, t = t^ + dt; rad and mm."""
 
 
 @dataclass(frozen=True, config=FILE_PART)

@@ -28,6 +28,7 @@ from rmis_calib.results.parts import (
     Consistency,
     HeadPointError,
     Information,
+    InstrumentBase,
     KinematicOffsets,
     Motions,
     Nuisance,
@@ -122,6 +123,9 @@ class CalibrationResult:
     setup: Setup | None = None
     """The pose of one arm's base in the other's with the covariance of both transforms; absent where it was not
     estimated."""
+    instrument_base: InstrumentBase | None = None
+    """The pose of the instrument's base in the camera, where the laparoscope stood still and the set-up was believed;
+    absent elsewhere."""
     information: Information | None = None
     """What pooling with other recordings needs beside the covariance; null for `paper` and `global`."""
     created: str = field(default_factory=_now)
@@ -190,8 +194,9 @@ class CalibrationResult:
     def to_dict(self) -> dict[str, Any]:
         """The result as plain JSON values, every number finite or None; the answer first."""
         record = record_type().dump_python(self, mode="json", by_alias=True)
-        if record["setup"] is None:  # as in results of before
-            del record["setup"]
+        for name in ("setup", "instrument_base"):  # as in results of before
+            if record[name] is None:
+                del record[name]
         return {key: record[key] for key in (*_ANSWER, *record)}
 
     def write(self, path: str | Path) -> None:

@@ -16,8 +16,8 @@ from rmis_calib.solver.assess.assemble import (
     joint_solution,
     two_step_solution,
 )
+from rmis_calib.solver.assess.evidence import CHANCE, freed, weigh
 from rmis_calib.solver.assess.information import motion_information, select_d_optimal
-from rmis_calib.solver.estimate.evidence import CHANCE, chances, freed
 from rmis_calib.solver.estimate.map_estimate import map_estimate
 from rmis_calib.solver.estimate.relinearise import Kinematics, solve_relinearised, start_of
 from rmis_calib.solver.model.measurement_rows import pack
@@ -55,9 +55,9 @@ def solve(
         differentiable: whether `camera_right_T_arm`, `camera_left_T_camera_right` and `covariance` pass gradients to
             the problem's tensors. They are those of the whole solve, by implicit differentiation at the answer
             (estimate/on_graph.py), noise levels and bias correction included; held are the choices that jump: which
-            measurements are outliers, which basin was taken, which motions are kept, and by how much the covariance
-            grows as groups of motions disagree. All motions are on the graph at
-            once: about 100 kB each in `joint`. Gradients of trials that did not converge mean nothing.
+            measurements are outliers, which basin was taken, which motions are kept, by how much the covariance
+            grows as groups of motions disagree, and what it allows for besides (`Solution.doubt`). All motions are on
+            the graph at once: about 100 kB each in `joint`. Gradients of trials that did not converge mean nothing.
 
     Raises:
         InputError: `differentiable` together with `kinematics` or `alternative`.
@@ -148,7 +148,7 @@ def _solve_flat(
         else:
             own = _of_motions(kinematics, index)
             fit = solve_relinearised(start_of(chosen.detach(), settings, own), settings, own)
-        solution = replace(joint_solution(fit, settings, alternative), evidence=chances(fit, settings))
+        solution = joint_solution(fit, settings, weigh(fit, settings), alternative)
     if on_graph:
         attached = flat if index is None else flat.select_motions(index)
         if settings.unknowns.setup != "known":
@@ -207,9 +207,7 @@ def with_setup(settings: SolverSettings, problem: Problem, method: Method) -> So
         return settings
     stated = torch.isfinite(problem.setup_stated).flatten(-2).all(-1)
     chosen = asked if bool(stated.all()) else "free"
-    if chosen == "known" and bool(
-        (torch.isfinite(problem.noise.setup_mm) | torch.isfinite(problem.noise.setup_rad)).any()
-    ):
+    if chosen == "known" and bool(((problem.noise.setup_mm > 0) | (problem.noise.setup_rad > 0)).any()):
         chosen = "free" if bool(problem.laparoscope_stands_still.all()) else "prior"
     if chosen != "known" and method != "joint":
         raise InputError(

@@ -89,14 +89,23 @@ class UnknownSettings:
     without good encoders tell."""
     setup_sigma_deg: Positive = 5.0
     """Prior of its orientation, likewise."""
+    setup_doubt_mm: NotNegative = 2.0
+    """How far a stated set-up may be off, 1 sigma per axis, that is believed and for which nobody states a sigma. It
+    enters the covariance as far as the data cannot tell: in full where the laparoscope stands still."""
+    setup_doubt_deg: NotNegative = 0.5
+    """The same of its orientation."""
+    doubt: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.5
+    """Probability, before the data speak, that a believed set-up is off by about its doubt, and that the instrument's
+    arm gives way by about its prior. It decides how much the covariance allows for that, not the estimate; 0 trusts
+    both."""
     compliance: Literal["never", "auto", "always"] = "auto"
     """Estimate by how much the instrument's arm gives way: a bend and a shift of the shaft that change smoothly with
     its pose (a flexing cannula, a remote centre that moves, joints that wind up). `auto`: where the
     laparoscope moves, its own kinematics are told, and the data ask for it."""
     compliance_sigma_deg: Positive = 0.1
-    """Prior of each coefficient of the bend."""
+    """Prior of the bend's mean and of its linear terms; half of it of the second order, and so on."""
     compliance_sigma_mm: Positive = 0.3
-    """Prior of each coefficient of the shift."""
+    """The same of the shift."""
     held_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.95
     """An unknown whose sigma the data do not bring below this part of its prior is reported as held."""
 

@@ -50,6 +50,15 @@ class SetupEstimate:
 
 
 @dataclass(frozen=True)
+class InstrumentBase:
+    """The pose of the instrument's base in the camera, where a laparoscope stands still, with its covariance as that of
+    `camera_right_T_arm`: the data tell it whatever the set-up is."""
+
+    camera_right_T_instrument_base: Float[Tensor, "*batch 4 4"]
+    covariance: Float[Tensor, "*batch 6 6"]
+
+
+@dataclass(frozen=True)
 class AlternativeModel:
     """The answer of another model of the same data, and the probability that it is that model which is right."""
 
@@ -114,11 +123,11 @@ class GroupCheck:
     change_at: Int[Tensor, " b"]
 
     @classmethod
-    def none(cls, used: Bool[Tensor, "b n"], like: Float[Tensor, "b 3"]) -> "GroupCheck":
+    def none(cls, motions: int, like: Float[Tensor, "b 3"]) -> "GroupCheck":
         """Where motions are too few for groups."""
         b, zero = len(like), torch.zeros_like(like[:, 0])
         return cls(
-            group=torch.full_like(used, -1, dtype=torch.int64),
+            group=torch.full((b, motions), -1, dtype=torch.int64, device=like.device),
             count=0,
             shift=like.new_zeros(b, 0, 6),
             sigmas=like.new_zeros(b, 0),
@@ -192,8 +201,11 @@ class Solution:
         frame: what `arm` is: `arm`, the laparoscope's; or `instrument_base` where the set-up is unknown and the
             laparoscope stands still: the pose of the instrument's base in the camera is then all there is to know.
         setup: the pose of one arm's base in the other's and the joint covariance, where it was estimated.
+        instrument_base: what the data tell of a laparoscope that stands still, where the set-up is believed.
         evidence: chance of what the data say if an unknown that was left out were nominal, by name
-            (estimate/evidence.py); of the first solve.
+            (assess/evidence.py); of the first solve.
+        doubt: what the covariance allows for, by name, as an unknown that was left out may not be nominal; of the last
+            solve.
         information_kept: part of the information (per parameter, geometric mean) that thinning kept; 1 without.
     """
 
@@ -222,7 +234,9 @@ class Solution:
     history: tuple[Float[Tensor, "..."], ...] = ()
     frame: str = "arm"
     setup: SetupEstimate | None = None
+    instrument_base: InstrumentBase | None = None
     evidence: dict[str, Float[Tensor, "*batch"]] = field(default_factory=dict)
+    doubt: dict[str, Float[Tensor, "*batch 6 6"]] = field(default_factory=dict)
     information_kept: float = 1.0
 
     @property
@@ -271,12 +285,25 @@ def concatenate(groups: list[Solution]) -> Solution:
         name: torch.cat([group.evidence.get(name, torch.full_like(group.cheirality, torch.nan)) for group in groups])
         for name in dict.fromkeys(name for group in groups for name in group.evidence)
     }
+    doubt = {
+        name: torch.cat([group.doubt.get(name, torch.zeros_like(group.covariance)) for group in groups])
+        for name in dict.fromkeys(name for group in groups for name in group.doubt)
+    }
     same = all(group.nuisances.keys() == names.keys() and group.posterior is not None for group in groups)
+    still = all(group.instrument_base is not None for group in groups)
     parts = [
-        replace(group, nuisances={}, evidence={}, setup=setup, posterior=group.posterior if same else None)
+        replace(
+            group,
+            nuisances={},
+            evidence={},
+            doubt={},
+            setup=setup,
+            posterior=group.posterior if same else None,
+            instrument_base=group.instrument_base if still else None,
+        )
         for group, setup in zip(groups, setups, strict=True)
     ]
-    return replace(_joined(parts), nuisances=nuisances, evidence=evidence)
+    return replace(_joined(parts), nuisances=nuisances, evidence=evidence, doubt=doubt)
 
 
 def _no_setup(group: Solution) -> SetupEstimate:

@@ -35,6 +35,7 @@ CAMERAS = {"sigma_focal": 0.005, "sigma_centre": 3.0 / FOCAL_PX, "sigma_lens": 0
 CHAINS = ("laparoscope_base_T_arm", "laparoscope_base_T_instrument_base")
 MODES = (("before", 0, {}, False), ("groups", 8, {}, False), ("cameras", 8, CAMERAS, False))
 MODES = (*MODES, ("evidence", 8, CAMERAS, True))
+MODES = (*MODES, ("exact", 8, CAMERAS | {"sigma_setup_mm": 0.0, "sigma_setup_rad": 0.0}, True))
 """Name, groups that are left out, priors of the cameras, and whether the set-up and what the arm gives way are freed by
 evidence."""
 INSIDE_95, BEYOND_3_SIGMA = 12.592, 20.14
@@ -151,6 +152,7 @@ def main() -> None:
                 if mode not in arguments.modes:
                     continue
                 given = {key: value for key, value in keys.items() if evidence or key not in CHAINS}
+                given = {key: value for key, value in given.items() if "sigma_setup" not in key}
                 problem = Problem.from_arrays(given | known).only("axis", "contours", "ends")
                 asked = {"groups": groups, "unknowns": {"compliance": "auto" if evidence else "never"}}
                 found = solve(problem, parse_config({"solver": asked}).solver)

@@ -12,7 +12,7 @@ from data_synth.settings import LineStudyConfig
 from rmis_calib.config import parse_config
 from rmis_calib.errors import InputError
 from rmis_calib.solver import Problem, SolverSettings, solve
-from rmis_calib.solver.settings import NoiseSettings
+from rmis_calib.solver.settings import NoiseSettings, UnknownSettings
 
 STEP = 1e-3
 CHANGES = {
@@ -20,14 +20,17 @@ CHANGES = {
     "end_xy": 3e-4, "head_xy": 3e-4, "radius_mm": 1e-2,
 }  # fmt: skip
 """What is differentiated by, and how large a change of it is as large as noise."""
-PLAIN = SolverSettings(robust="off", bias_correction=False, noise=NoiseSettings(estimate="never"), groups=0)
+NO_DOUBT = UnknownSettings(doubt=0.0)  # what the covariance allows for besides is held
+PLAIN = SolverSettings(
+    robust="off", bias_correction=False, noise=NoiseSettings(estimate="never"), unknowns=NO_DOUBT, groups=0
+)
 CASES = {
     "paper": ("paper", SolverSettings()),
     "global": ("global", SolverSettings()),
     "joint, noise known": ("joint", PLAIN),
     "joint, bias": ("joint", replace(PLAIN, bias_correction=True)),
     "joint, noise estimated": ("joint", replace(PLAIN, noise=NoiseSettings(estimate="always"))),
-    "joint, everything": ("joint", SolverSettings(noise=NoiseSettings(estimate="always"), groups=0)),
+    "joint, everything": ("joint", SolverSettings(noise=NoiseSettings(estimate="always"), unknowns=NO_DOUBT, groups=0)),
     "joint, thinned": ("joint", replace(PLAIN, thin_to=30)),
 }
 

@@ -9,7 +9,9 @@ from torch import Tensor
 from rmis_calib.geometry.rigid import rigid_exp, rigid_from_rotation_translation, rigid_inverse, rigid_log
 from rmis_calib.geometry.rotations import matrix_to_rotvec
 from rmis_calib.solver.assess.clock_jump import find_clock_jump
+from rmis_calib.solver.assess.evidence import Evidence, reported
 from rmis_calib.solver.assess.groups import check_groups
+from rmis_calib.solver.assess.instrument_base import instrument_base
 from rmis_calib.solver.assess.observability import assess, detect_degeneracies, turns_about_one_axis
 from rmis_calib.solver.estimate.map_estimate import MapEstimate
 from rmis_calib.solver.estimate.multistart import cheirality
@@ -104,8 +106,14 @@ def _unseen_depth(flat: Problem, R: Tensor, t: Tensor) -> Float[Tensor, "b 6 6"]
     return torch.nn.functional.pad(torch.where(unseen[:, None, None], block, 0.0), (3, 0, 3, 0))
 
 
-def joint_solution(fit: MapEstimate, settings: SolverSettings, alternative: AlternativeModel | None = None) -> Solution:
-    """Solution of the joint estimate; its covariance allows for the alternative model."""
+def joint_solution(
+    fit: MapEstimate,
+    settings: SolverSettings,
+    evidence: Evidence,
+    alternative: AlternativeModel | None = None,
+) -> Solution:
+    """Solution of the joint estimate; its covariance allows for unknowns that were left out, and for the alternative
+    model."""
     measured, state = fit.model.measured, fit.state
     C = fit.covariance[:, :6, :6]
     status, reason, excess = _judge(fit)
@@ -113,16 +121,22 @@ def joint_solution(fit: MapEstimate, settings: SolverSettings, alternative: Alte
     groups = check_groups(fit, settings.groups)
     C = groups.grown(C)
     jump = find_clock_jump(fit, excess, groups)
-    setup = _setup(fit, excess, groups)
+    setup = _setup(fit, excess, groups, evidence)
+    for name in evidence.doubt.keys() - {"setup"}:
+        C = C + evidence.doubt[name][:, :6, :6]
     if alternative is not None:
         C = _mixed(C, state.R, state.t, alternative)
+    camera_right_T_arm, base = rigid_from_rotation_translation(state.R, state.t), None
+    if "setup" in evidence.doubt:
+        base = instrument_base(fit.problem, camera_right_T_arm, C)
+        C = C + evidence.doubt["setup"]
     distance = (fit.distance2 / measured.rows_ok.sum(0).clamp_min(1)).sqrt()
     uses = (measured.has_contours, measured.has_ends, measured.has_heads)
     left = rigid_from_rotation_translation(state.stereo_R, state.stereo_t) if measured.cameras == 2 else None
     shown = _residuals(measured, state)
     return Solution(
         method="joint",
-        camera_right_T_arm=rigid_from_rotation_translation(state.R, state.t),
+        camera_right_T_arm=camera_right_T_arm,
         camera_left_T_camera_right=left,
         covariance=C,
         status=status,
@@ -137,6 +151,9 @@ def joint_solution(fit: MapEstimate, settings: SolverSettings, alternative: Alte
         groups=groups,
         clock_jump=jump,
         setup=setup,
+        instrument_base=base,
+        evidence=evidence.chance,
+        doubt={name: doubt[:, :6, :6] for name, doubt in evidence.doubt.items()},
         history=fit.history,
         observability=_observability(fit.problem, state.R, state.t, C, fit.model.noise, uses, settings),
         posterior=_posterior(fit, excess.clamp_min(1.0)),
@@ -159,35 +176,46 @@ def joint_on_graph(solution: Solution, problem: Problem, fit: MapEstimate, setti
     excess = found.chi2 / (rows - 6.0).clamp_min(1.0)
     covariance = found.covariance[:, :6, :6] * excess.clamp_min(1.0)[:, None, None]
     left = solution.camera_left_T_camera_right
+    if solution.groups is not None:
+        covariance = solution.groups.grown(covariance)
+    for doubt in solution.doubt.values():
+        covariance = covariance + doubt.detach()
     return replace(
         solution,
         camera_right_T_arm=rigid_from_rotation_translation(found.state.R, found.state.t),
         camera_left_T_camera_right=None
         if left is None
         else rigid_from_rotation_translation(found.state.stereo_R, found.state.stereo_t),
-        covariance=covariance if solution.groups is None else solution.groups.grown(covariance),
+        covariance=covariance,
     )
 
 
-def _setup(fit: MapEstimate, excess: Float[Tensor, " b"], groups: GroupCheck) -> SetupEstimate | None:
-    """The set-up that was estimated, and the joint covariance, grown like that of the transform."""
-    part, at = fit.model.layout.blocks.get("setup"), fit.problem.laparoscope_base_T_instrument_base
-    if part is None or at is None:
+def _setup(
+    fit: MapEstimate, excess: Float[Tensor, " b"], groups: GroupCheck, evidence: Evidence
+) -> SetupEstimate | None:
+    """The set-up that was estimated, and the joint covariance, grown like that of the transform, with its doubts."""
+    at = fit.problem.laparoscope_base_T_instrument_base
+    if "setup" not in fit.model.layout.blocks or at is None:
         return None
-    b, index = len(excess), [*range(6), *range(part.start, part.stop)]
+    b, index = len(excess), reported(fit.model.layout)
     estimate = at @ rigid_exp(fit.state.setup)
     # From a perturbation on the right, in `instrument_base`, to one on the left.
     turn = torch.zeros(b, 12, 12, dtype=at.dtype, device=at.device)
     turn[:, :6, :6] = groups.growth
     turn[:, 6:9, 6:9] = turn[:, 9:, 9:] = groups.inflation[:, None, None] * estimate[:, :3, :3]
     covariance = fit.covariance[:, index][:, :, index] * excess.clamp_min(1.0)[:, None, None]
+    covariance = turn @ covariance @ turn.mT
+    turn[:, :6, :6] = torch.eye(6, dtype=at.dtype, device=at.device)
+    turn[:, 6:9, 6:9] = turn[:, 9:, 9:] = estimate[:, :3, :3]
+    for doubt in evidence.doubt.values():
+        covariance = covariance + turn @ doubt @ turn.mT
     stated = fit.problem.setup_stated
     known = torch.full_like(at, torch.nan) if stated is None else stated
     is_known = torch.isfinite(known).flatten(1).all(-1)
     away = rigid_log(rigid_inverse(torch.where(is_known[:, None, None], known, estimate)) @ estimate)
     return SetupEstimate(
         laparoscope_base_T_instrument_base=estimate,
-        covariance=turn @ covariance @ turn.mT,
+        covariance=covariance,
         from_stated=torch.where(is_known[:, None], away, torch.nan),
     )
 

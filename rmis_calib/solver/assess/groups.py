@@ -14,7 +14,7 @@ units of the answer's own covariance, W = (sum V_k)^-1/2 (sum d_k d_k^T) (sum V_
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from rmis_calib.solver.assess.information import inverse
@@ -41,7 +41,7 @@ HARDLY_SEEN = 40.0
 """Variance of a difference of two parts, in that of the answer of all, from which a direction does not count."""
 LARGEST = 1e9
 """Squared sigmas beyond which nothing differs any more."""
-_RIDGE = 0.02
+RIDGE = 0.02
 """In units of the covariance: a direction that no group moves (it is the prior's) counts as agreeing."""
 
 
@@ -53,12 +53,9 @@ def check_groups(fit: MapEstimate, asked: int) -> GroupCheck:
         asked: groups wanted; fewer where motions are few.
     """
     measured, state = fit.model.measured, fit.state
-    used = ((fit.weight > REJECTED) & (measured.rows_seen > 0)).any(0)  # (b, n)
-    count = min(asked, measured.motions // MOTIONS_A_GROUP)
-    if count < LEAST_GROUPS:
-        return GroupCheck.none(used, state.t)
-    place = where_motions_are(measured)
-    group = neighbours(place, used, count)
+    group, count, enough = groups_of(fit.model, asked)
+    if count == 0:
+        return GroupCheck.none(measured.motions, state.t)
     block = torch.arange(measured.motions, device=group.device) * count // measured.motions
     in_time = membership(block.expand_as(group), count, state.t.dtype)
     model, in_full = fit.model, recounted(fit, in_time[0])
@@ -73,7 +70,7 @@ def check_groups(fit: MapEstimate, asked: int) -> GroupCheck:
     shift = (rest @ s_k[..., None])[..., :6, 0]
     covariance, covariance_k = inverse(H)[..., :6, :6], rest[..., :6, :6]
     told = torch.isfinite(shift).flatten(1).all(-1) & (covariance.diagonal(dim1=-2, dim2=-1) > TINY).all(-1)
-    enough = told & (used.sum(-1) >= LEAST_USED * count)
+    enough = told & enough
     eye = torch.eye(6, dtype=shift.dtype, device=shift.device)
     covariance = torch.where(told[:, None, None], covariance, eye)
     covariance_k = torch.where(told[:, None, None, None], covariance_k, eye)
@@ -84,12 +81,12 @@ def check_groups(fit: MapEstimate, asked: int) -> GroupCheck:
     factor, turn = _growth(own, extra)
     factor = torch.where(enough[:, None], factor, 1.0)
     growth = root @ (turn * factor.sqrt()[:, None] @ turn.mT) @ inverse_root
-    first_half = _first_half(place, group, count)
+    first_half = _first_half(where_motions_are(measured), group, count)
     halves, apart = _difference(H_k, s_k, prior, deviation, first_half[:, None], growth, inverse_root)
     before = torch.tril(torch.ones(count - 1, count, dtype=prior.dtype, device=prior.device)).expand(len(prior), -1, -1)
     changes, change_apart = _difference(H_t, s_t, prior, deviation, before, growth, inverse_root)
     clearest = change_apart.argmax(-1)
-    sigmas = torch.linalg.solve(extra + _RIDGE * eye, own[..., None])[..., 0]
+    sigmas = torch.linalg.solve(extra + RIDGE * eye, own[..., None])[..., 0]
     return GroupCheck(
         group=torch.where(enough[:, None], group, -1),
         count=count,
@@ -105,6 +102,18 @@ def check_groups(fit: MapEstimate, asked: int) -> GroupCheck:
     )
 
 
+def groups_of(model: WeightedModel, asked: int) -> tuple[Int[Tensor, "b n"], int, Bool[Tensor, " b"]]:
+    """Number of each used motion's group (-1: not used), how many groups (0: motions are too few), and the trials that
+    have enough used motions for them."""
+    measured = model.measured
+    seen = measured.rows_seen > 0
+    used = (seen if model.weight is None else seen & (model.weight > REJECTED)).any(0)  # (b, n)
+    count = min(asked, measured.motions // MOTIONS_A_GROUP)
+    if count < LEAST_GROUPS:
+        return torch.full_like(used, -1, dtype=torch.int64), 0, torch.zeros_like(used[:, 0])
+    return neighbours(where_motions_are(measured), used, count), count, used.sum(-1) >= LEAST_USED * count
+
+
 def _growth(
     own: Float[Tensor, "b k 6"], extra: Float[Tensor, "b k 6 6"]
 ) -> tuple[Float[Tensor, "b 6"], Float[Tensor, "b 6 6"]]:
@@ -117,9 +126,9 @@ def _growth(
         own: shifts when a group is left out, in units of the covariance.
         extra: covariance of each that noise alone would make, in the same units.
     """
-    ridge = _RIDGE * torch.eye(6, dtype=own.dtype, device=own.device)
+    ridge = RIDGE * torch.eye(6, dtype=own.dtype, device=own.device)
     expected, axes = torch.linalg.eigh(_bounded(extra.sum(1)) + ridge)
-    narrow = axes * expected.clamp_min(_RIDGE).rsqrt()[:, None] @ axes.mT
+    narrow = axes * expected.clamp_min(RIDGE).rsqrt()[:, None] @ axes.mT
     W = narrow @ (_bounded(own.mT @ own) + ridge) @ narrow
     values, vectors = torch.linalg.eigh(_bounded(0.5 * (W + W.mT)))
     mean = values.mean(-1, keepdim=True).clamp_min(1.0)
@@ -223,7 +232,7 @@ def _difference(
     # The growth takes both covariances and the unit that they are measured in along, so that it acts on the gap alone.
     own = gap @ (inverse_root @ torch.linalg.inv(growth)).mT
     values, vectors = torch.linalg.eigh(_bounded(variances[0] + variances[1]))
-    along = (vectors.mT @ _bounded(own)[..., None])[..., 0].square() / values.clamp_min(_RIDGE)
+    along = (vectors.mT @ _bounded(own)[..., None])[..., 0].square() / values.clamp_min(RIDGE)
     # A part that hardly sees a direction has little to say of it, and noise in its Jacobian looks like sight.
     return gap, torch.where(values < HARDLY_SEEN, along, 0.0).sum(-1).sqrt()
 

@@ -19,6 +19,8 @@ TURNS, SHIFTS = 2, 3
 """Components: rotations about, and translations along two directions across the shaft; and the translation along it."""
 MEAN_SQUARES = (1.0, *(1 / 3,) * 3, *(1 / 5,) * 3, *(1 / 7,) * 2, *(1 / 9,) * 5)
 """Of each function over its range."""
+PRIORS = (1.0, *(1.0,) * 3, *(1 / 2,) * 3, *(1 / 4,) * 2, *(1 / 8,) * 2, *(1 / 2,) * 3)
+"""Prior sigma of each function's coefficient, in that of the constant: what is smooth has little of the high orders."""
 COUNT = FUNCTIONS * (TURNS + SHIFTS)
 LEAST_REACH_RAD, LEAST_REACH_MM = 5e-3, 2.0
 """Half of the range of an angle, and of the insertion, below which nothing depends on it."""

@@ -10,7 +10,7 @@ from torch import Tensor
 from rmis_calib.errors import InputError
 from rmis_calib.geometry.rigid import rigid_inverse, rigid_log
 from rmis_calib.solver.model.batched_linalg import add_cross_, batch_last, cross, dot, rotate
-from rmis_calib.solver.model.compliance import COUNT, FUNCTIONS, SHIFTS, TURNS, basis
+from rmis_calib.solver.model.compliance import COUNT, FUNCTIONS, PRIORS, SHIFTS, TURNS, basis
 from rmis_calib.solver.model.linearised_rows import LinearisedRows
 from rmis_calib.solver.model.measurement_rows import LINE, MeasurementRows, line_points
 from rmis_calib.solver.model.predicted_shaft import Shaft, rcm_axes
@@ -128,7 +128,7 @@ class NuisancePriors:
         intrinsics: prior of each camera's corrections; 0 where there is none.
         setup_at: where the kinematics were evaluated, from the stated set-up (from none: the identity); as
             `State.setup`.
-        setup_mm, setup_rad: given sigmas of the stated set-up; NaN where unknown.
+        setup_mm, setup_rad: given sigmas of the stated set-up; NaN where unknown, 0 where it is exact.
     """
 
     stereo: Float[Tensor, "b 4 4"]
@@ -236,7 +236,7 @@ def make_layout(
         entries.append(("setup", 6, _setup_sigma(nominal, settings)))
     if settings.compliance == "always":
         turn, shift = math.radians(settings.compliance_sigma_deg), settings.compliance_sigma_mm
-        each = like.new_tensor([turn] * (TURNS * FUNCTIONS) + [shift] * (SHIFTS * FUNCTIONS))
+        each = like.new_tensor([size * prior for size in (*[turn] * TURNS, *[shift] * SHIFTS) for prior in PRIORS])
         entries.append(("compliance", COUNT, each.expand(b, -1)))
     entries = [entry for entry in entries if bool((entry[2] > 0).any())]
     blocks, sigmas, start = {}, [], 0
@@ -253,8 +253,9 @@ def _setup_sigma(nominal: NuisancePriors, settings: UnknownSettings) -> Float[Te
     if settings.setup == "free":
         rad, mm = torch.full_like(nominal.setup_rad, torch.inf), torch.full_like(nominal.setup_mm, TRANSLATION_SIGMA_MM)
     else:
-        rad = torch.nan_to_num(nominal.setup_rad, nan=math.radians(settings.setup_sigma_deg))
-        mm = torch.nan_to_num(nominal.setup_mm, nan=settings.setup_sigma_mm)
+        # One that is stated to be exact, and yet to be estimated, is none.
+        rad = torch.where(nominal.setup_rad > 0, nominal.setup_rad, math.radians(settings.setup_sigma_deg))
+        mm = torch.where(nominal.setup_mm > 0, nominal.setup_mm, settings.setup_sigma_mm)
     return torch.stack((rad, rad, rad, mm, mm, mm), dim=-1)
 
 

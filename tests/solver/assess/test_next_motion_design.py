@@ -11,7 +11,8 @@ from rmis_calib.solver.assess.next_motion import advise, measured_alike
 from tests.benchmarks.bench_solver_advice import SETTINGS as WITH_CORRECTION
 from tests.benchmarks.bench_solver_advice import VIEW, left, measure, next_motion, weak_recordings
 
-SETTINGS = replace(WITH_CORRECTION, bias_correction=False, groups=0)
+WITHOUT_DOUBT = replace(WITH_CORRECTION.unknowns, doubt=0.0)
+SETTINGS = replace(WITH_CORRECTION, bias_correction=False, groups=0, unknowns=WITHOUT_DOUBT)
 WEAK = weak_recordings()
 
 
