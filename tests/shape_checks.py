@@ -97,7 +97,7 @@ def _key(args: tuple, kwargs: dict) -> tuple | None:
     try:
         key = tuple([_kind(value) for value in args])
         return key + tuple([(name, _kind(value)) for name, value in kwargs.items()]) if kwargs else key
-    except _Unknown:
+    except (_Unknown, RecursionError):  # a list of a damaged YAML file may hold itself
         return None
 
 

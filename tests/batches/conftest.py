@@ -17,7 +17,13 @@ _COMMON = ("shaft_radius_mm", "sigma_image", "sigma_kinematics_mm", "sigma_kinem
            "sigma_stereo_rad", "camera_left_T_camera_right")  # fmt: skip
 _BY_MOTION = ("arm_T_rcm", "rcm_v_axis", "rcm_s_end_mm", "axis_right", "contour_right", "end_right", "valid_right",
               "axis_left", "contour_left", "end_left", "valid_left")  # fmt: skip
-SOLVER = {"solver": {"noise": {"estimate": "never"}, "unknowns": {"edge_bias": False}, "groups": 0}}
+SOLVER = {
+    "solver": {
+        "noise": {"estimate": "never"},
+        "unknowns": {"edge_bias": False, "doubt": 0.0},  # the covariance is the inverse of the information
+        "groups": 0,
+    }
+}
 
 
 @pytest.fixture(scope="session")

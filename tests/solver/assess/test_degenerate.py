@@ -134,7 +134,7 @@ def test_every_case_is_named_in_words_with_its_remedy(case):
     words = described.sentences[0].rpartition(": ")[2]
     assert len(words.split()) >= 5 and "_" not in words
     (remedy,) = sight.remedies()
-    assert remedy.split()[0] in ("move", "give", "turn", "use", "keep")
+    assert remedy.split()[0] in ("move", "state", "turn", "use", "keep")
 
 
 def test_lines_of_somebody_else_are_not_fitted():
