@@ -178,20 +178,20 @@ def _without_joint_offsets(config: CalibrationConfig) -> CalibrationConfig:
 def _choose_again(run: CalibrationRun, config: CalibrationConfig, several: bool, progress: Progress) -> CalibrationRun:
     """Solve with the candidates nearest to what the answer before predicts, until these stay."""
     for _ in range(CHOICE_ROUNDS - 1):
-        better = _better_choices(run, several)
+        better = better_choices(run, several)
         if better is None or all(new.same_as(old) for new, old in zip(better, run.choices, strict=True)):
             break
         run = _solve_again(run, config, better, progress)
     return run
 
 
-def _better_choices(run: CalibrationRun, several: bool) -> tuple[Choice, ...] | None:
+def better_choices(run: CalibrationRun, several: bool) -> tuple[Choice, ...] | None:
     """Candidates nearest to what the first answer predicts; None when there is no answer to predict from.
 
     Only of pictures that show several instruments any is passed over: in others, what does not fit speaks against the
-    answer.
+    answer. An answer that the data do not determine still predicts these motions: what is open moves no contour.
     """
-    if run.result.status not in ("ok", "weak"):
+    if run.result.status not in ("ok", "weak", "unobservable"):
         return None
     used = torch.as_tensor(run.result.motions.used[run.poses.frames], device=run.poses.arm_T_rcm.device)
     better = []

@@ -21,7 +21,7 @@ from rmis_calib.pipeline.association import (
     pointed_at,
     read_prior,
 )
-from rmis_calib.pipeline.calibration import run_calibration
+from rmis_calib.pipeline.calibration import better_choices, run_calibration
 from rmis_calib.pipeline.poses import motion_poses
 from rmis_calib.vision import ShaftDetections
 
@@ -200,6 +200,22 @@ def test_the_instrument_that_moves_with_the_joints_is_the_one_that_calibrates(tm
     # The surest candidates of a fifth of the pictures are the other instrument's.
     assert run.result.motions.used.sum() > 25
     check_what_is_known_beforehand(recording, run, config, folder)
+    check_an_answer_that_is_open_still_chooses(run)
+
+
+def check_an_answer_that_is_open_still_chooses(run):
+    """Where no picture tells on which side the tip is, and the answer is not determined, it still tells both."""
+    views = []
+    for view in run.views:
+        unknown = torch.zeros_like(view.detections.direction_known)
+        views.append(replace(view, detections=replace(view.detections, direction_known=unknown)))
+    is_open = replace(run, views=tuple(views), result=replace(run.result, status="unobservable"))
+    for own, again in zip(run.choices, better_choices(is_open, True), strict=True):
+        taken = own.taken & again.taken
+        assert float((own.taken == again.taken).double().mean()) > 0.9
+        assert torch.equal(own.candidate[taken], again.candidate[taken])
+        assert not again.reversed[taken].any()  # the tip is where the walk from the border ends
+    assert better_choices(replace(is_open, result=replace(run.result, status="solver_failed")), True) is None
 
 
 def check_what_is_known_beforehand(recording, run, config, folder):
