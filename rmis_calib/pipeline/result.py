@@ -71,7 +71,7 @@ def make_result(
         *_about_ends(solution),
         *about_groups(consistency),
         *about_cameras(solution),
-        *about_setup(solution, frame),
+        *about_setup(solution, frame, config.solver.unknowns),
         *about_compliance(solution),
     )
     finite = bool(torch.isfinite(solution.camera_right_T_arm).all())

@@ -7,6 +7,7 @@ from rmis_calib.geometry.rigid import RigidTransform
 from rmis_calib.results import INSTRUMENT_BASE, InstrumentBase, Setup
 from rmis_calib.solver import Solution
 from rmis_calib.solver.model.compliance import FUNCTIONS, MEAN_SQUARES, TURNS
+from rmis_calib.solver.settings import UnknownSettings
 from rmis_calib.solver.solution import Nuisance
 
 
@@ -43,7 +44,7 @@ def instrument_base_of(solution: Solution) -> InstrumentBase | None:
     )
 
 
-def about_setup(solution: Solution, frame: str) -> tuple[str, ...]:
+def about_setup(solution: Solution, frame: str, asked: UnknownSettings) -> tuple[str, ...]:
     """What became of the pose of one arm's base in the other's, in words."""
     if frame == INSTRUMENT_BASE:
         return (
@@ -60,8 +61,8 @@ def about_setup(solution: Solution, frame: str) -> tuple[str, ...]:
             "The laparoscope did not move: what the data tell is camera_right_T_instrument_base, to "
             f"{base.rotation_sigma_deg:.2g} deg, {base.translation_sigma_mm:.2g} mm (1 sigma; instrument_base in "
             "result.json). camera_right_T_arm is only as right as base_T_arm_base: setup_sigma_mm and setup_sigma_deg "
-            "in robot.yaml say how well that is known (0: exactly); where they do not, its sigma allows for 2 mm and "
-            "0.5 deg.",
+            "in robot.yaml say how well that is known (0: exactly); where they do not, its sigma allows for "
+            f"{asked.setup_doubt_mm:g} mm and {asked.setup_doubt_deg:g} deg.",
         )
     known = f"to {found.rotation_sigma_deg:.2g} deg, {found.translation_sigma_mm:.2g} mm (1 sigma)"
     if found.from_stated_mm is None:
