@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from rmis_calib.io import Recording
 from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
@@ -20,22 +22,26 @@ def poses_at(recording: Recording, offsets: KinematicOffsets, device: str = "cpu
     poses = motion_poses(recording, device)
     if any(offsets.clock) or any(offsets.joints.values()):
         unknowns = KinematicUnknowns(recording, poses.frames, device)
-        values = [offsets.joints.get(column, 0.0) for column in unknowns.columns]
-        joint_offset = torch.tensor(values, dtype=torch.float64, device=device)
-        poses, known = unknowns.motion_poses(poses.frames, joint_offset, offsets.clock)
+        poses, known = unknowns.motion_poses(poses.frames, _joint_offset(unknowns, offsets, device), offsets.clock)
         poses = poses.select(known)
     return with_rcm_offset(with_setup(poses, offsets), offsets.rcm_mm)
 
 
 def poses_at_motions(
-    unknowns: "KinematicUnknowns", poses: MotionPoses, offsets: KinematicOffsets, later_s: float
+    unknowns: KinematicUnknowns, poses: MotionPoses, offsets: KinematicOffsets, later_s: float
 ) -> MotionPoses:
     """Poses of these motions with the offsets that were found, some time later."""
-    values = [offsets.joints.get(column, 0.0) for column in unknowns.columns]
-    joint_offset = torch.tensor(values, dtype=torch.float64, device=poses.arm_T_rcm.device)
-    offset_s, rate = offsets.clock
+    joint_offset, (offset_s, rate) = _joint_offset(unknowns, offsets, poses.arm_T_rcm.device), offsets.clock
     at, _ = unknowns.motion_poses(poses.frames, joint_offset, (offset_s + later_s, rate))
     return with_rcm_offset(with_setup(at, offsets), offsets.rcm_mm)
+
+
+def _joint_offset(
+    unknowns: KinematicUnknowns, offsets: KinematicOffsets, device: str | torch.device
+) -> Float[Tensor, " j"]:
+    """Offsets of the joints in the order of the kinematics; 0 for those that the result names none of."""
+    values = [offsets.joints.get(column, 0.0) for column in unknowns.columns]
+    return torch.tensor(values, dtype=torch.float64, device=device)
 
 
 def with_setup(poses: MotionPoses, offsets: KinematicOffsets) -> MotionPoses:
