@@ -12,8 +12,8 @@ from torch import Tensor
 from rmis_calib.errors import InputError, VideoError
 from rmis_calib.geometry.cameras import Camera, StereoRig
 from rmis_calib.io import FrameSource, JointLog, Recording
-from rmis_calib.pipeline.detection import View, concatenate
-from rmis_calib.pipeline.poses import MotionPoses
+from rmis_calib.pipeline.arms.poses import MotionPoses
+from rmis_calib.pipeline.pictures.detection import View, concatenate
 from rmis_calib.robot import Robot
 from rmis_calib.vision import ShaftDetections
 

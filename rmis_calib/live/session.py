@@ -23,15 +23,15 @@ from rmis_calib.io import Recording, load_recording
 from rmis_calib.io.robot import load_robot
 from rmis_calib.kinematics import RobotKinematics
 from rmis_calib.live.collected import Collected
-from rmis_calib.pipeline.advice import at_found_setup, with_next_motions
-from rmis_calib.pipeline.association import associate, consistent_choice, read_prior
+from rmis_calib.pipeline.answer.advice import at_found_setup, with_next_motions
+from rmis_calib.pipeline.answer.run import CalibrationRun
+from rmis_calib.pipeline.arms.found_offsets import with_setup
+from rmis_calib.pipeline.arms.poses import MotionPoses, poses_of, predict_contours
 from rmis_calib.pipeline.calibration import calibrate_views, solve_choices
-from rmis_calib.pipeline.detection import no_progress
-from rmis_calib.pipeline.found_offsets import with_setup
-from rmis_calib.pipeline.observations import DIRECTION_UNKNOWN, assemble, problem_of
-from rmis_calib.pipeline.poses import MotionPoses, poses_of, predict_contours
+from rmis_calib.pipeline.motions.association import associate, consistent_choice, read_prior
+from rmis_calib.pipeline.motions.observations import DIRECTION_UNKNOWN, assemble, problem_of
+from rmis_calib.pipeline.pictures.detection import no_progress
 from rmis_calib.pipeline.readiness import quick
-from rmis_calib.pipeline.run import CalibrationRun
 from rmis_calib.results import CalibrationResult
 from rmis_calib.robot import Robot
 from rmis_calib.solver import Problem

@@ -1,11 +1,11 @@
+from .answer.estimation import solve as solve
+from .answer.run import CalibrationRun as CalibrationRun
 from .calibration import calibrate as calibrate
 from .calibration import run_calibration as run_calibration
-from .detection import DetectionTable as DetectionTable
-from .detection import detect as detect
-from .estimation import solve as solve
+from .checks.findings import Finding as Finding
 from .evaluation import Evaluation as Evaluation
 from .evaluation import evaluate as evaluate
-from .findings import Finding as Finding
+from .pictures.detection import DetectionTable as DetectionTable
+from .pictures.detection import detect as detect
 from .readiness import RecordingCheck as RecordingCheck
 from .readiness import check as check
-from .run import CalibrationRun as CalibrationRun

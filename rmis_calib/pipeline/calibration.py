@@ -10,25 +10,25 @@ from rmis_calib.config import CalibrationConfig
 from rmis_calib.errors import InsufficientDataError
 from rmis_calib.geometry.rigid import RigidTransform
 from rmis_calib.io import Recording, ShaftObservations
-from rmis_calib.pipeline.advice import with_next_motions
-from rmis_calib.pipeline.association import Choice, associate, association_gate, consistent_choice, read_prior
-from rmis_calib.pipeline.background import about_background, without_background
-from rmis_calib.pipeline.detection import Progress, View, detect_recording, no_progress
+from rmis_calib.pipeline.answer.advice import with_next_motions
+from rmis_calib.pipeline.answer.estimation import estimate, raise_unless_trustworthy
+from rmis_calib.pipeline.answer.offsets import estimate_with_kinematics
+from rmis_calib.pipeline.answer.result import insufficient_data, make_result, motions_of, residual_of, residuals_px
+from rmis_calib.pipeline.answer.rolling_shutter import with_rows_at_one_instant
+from rmis_calib.pipeline.answer.run import CalibrationRun
+from rmis_calib.pipeline.arms.found_offsets import with_rcm_offset, with_setup
+from rmis_calib.pipeline.arms.kinematic_unknowns import recording_unknowns
+from rmis_calib.pipeline.arms.offset_unknowns import estimated_offsets
+from rmis_calib.pipeline.arms.poses import MotionPoses, frame_of, motion_poses
+from rmis_calib.pipeline.checks.findings import about_motions, about_order
+from rmis_calib.pipeline.checks.misfit import with_misfit_named
 from rmis_calib.pipeline.device import require_device
-from rmis_calib.pipeline.estimation import estimate, raise_unless_trustworthy
 from rmis_calib.pipeline.evaluation import head_point_errors, summarise_head_points
-from rmis_calib.pipeline.findings import about_motions, about_order
-from rmis_calib.pipeline.found_offsets import with_rcm_offset, with_setup
-from rmis_calib.pipeline.frozen import about_repeats, repeated_motions, without_frames
-from rmis_calib.pipeline.kinematic_unknowns import recording_unknowns
-from rmis_calib.pipeline.misfit import with_misfit_named
-from rmis_calib.pipeline.observations import assemble
-from rmis_calib.pipeline.offset_unknowns import estimated_offsets
-from rmis_calib.pipeline.offsets import estimate_with_kinematics
-from rmis_calib.pipeline.poses import MotionPoses, frame_of, motion_poses
-from rmis_calib.pipeline.result import insufficient_data, make_result, motions_of, residual_of, residuals_px
-from rmis_calib.pipeline.rolling_shutter import with_rows_at_one_instant
-from rmis_calib.pipeline.run import CalibrationRun
+from rmis_calib.pipeline.motions.association import Choice, associate, association_gate, consistent_choice, read_prior
+from rmis_calib.pipeline.motions.observations import assemble
+from rmis_calib.pipeline.pictures.background import about_background, without_background
+from rmis_calib.pipeline.pictures.detection import Progress, View, detect_recording, no_progress
+from rmis_calib.pipeline.pictures.frozen import about_repeats, repeated_motions, without_frames
 from rmis_calib.results import CalibrationResult
 from rmis_calib.solver.problem import stands_still
 from rmis_calib.vision.masks import Segmenter

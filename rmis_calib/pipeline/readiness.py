@@ -15,18 +15,18 @@ from torch import Tensor
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.geometry.cameras import Camera
 from rmis_calib.io import FrameBatch, FrameSource, Recording, load_recording
-from rmis_calib.pipeline.advice import at_found_setup, camera_view, may_advise
-from rmis_calib.pipeline.association import associate, read_prior
+from rmis_calib.pipeline.answer.advice import at_found_setup, camera_view, may_advise
+from rmis_calib.pipeline.answer.run import CalibrationRun
+from rmis_calib.pipeline.arms.kinematic_unknowns import KinematicUnknowns
+from rmis_calib.pipeline.arms.poses import MotionPoses, motion_poses
 from rmis_calib.pipeline.calibration import solve_choices
-from rmis_calib.pipeline.detection import View, no_progress, over_all
+from rmis_calib.pipeline.checks.findings import Finding, about_motions, about_order, about_pictures
 from rmis_calib.pipeline.device import require_device
-from rmis_calib.pipeline.findings import Finding, about_motions, about_order, about_pictures
-from rmis_calib.pipeline.frozen import ChangeMeter, about_repeats, repeated_motions
-from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
-from rmis_calib.pipeline.masks import MaskReader, open_masks
-from rmis_calib.pipeline.observations import problem_of
-from rmis_calib.pipeline.poses import MotionPoses, motion_poses
-from rmis_calib.pipeline.run import CalibrationRun
+from rmis_calib.pipeline.motions.association import associate, read_prior
+from rmis_calib.pipeline.motions.observations import problem_of
+from rmis_calib.pipeline.pictures.detection import View, no_progress, over_all
+from rmis_calib.pipeline.pictures.frozen import ChangeMeter, about_repeats, repeated_motions
+from rmis_calib.pipeline.pictures.masks import MaskReader, open_masks
 from rmis_calib.solver import SolveStatus
 from rmis_calib.solver.assess.information import inverse
 from rmis_calib.solver.assess.next_motion import measured_alike, predicted_information

@@ -13,8 +13,8 @@ from rmis_calib.geometry.rigid import rigid_inverse, transform_points
 from rmis_calib.io import Recording
 from rmis_calib.io.recording import log_times_s
 from rmis_calib.kinematics import RobotKinematics
-from rmis_calib.pipeline.found_offsets import with_found_bases
-from rmis_calib.pipeline.poses import check_apart
+from rmis_calib.pipeline.arms.found_offsets import with_found_bases
+from rmis_calib.pipeline.arms.poses import check_apart
 from rmis_calib.results import CalibrationResult, KinematicOffsets
 
 _NO_OFFSETS = KinematicOffsets({}, 0.0, (0.0, 0.0))

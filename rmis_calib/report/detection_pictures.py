@@ -12,7 +12,7 @@ import torch
 
 from rmis_calib.errors import OutputError
 from rmis_calib.io.video_writing import OverlayVideo
-from rmis_calib.pipeline.detection import DetectedBatch
+from rmis_calib.pipeline.pictures.detection import DetectedBatch
 from rmis_calib.report.drawing.frames import spread
 from rmis_calib.vision import FrameReason, draw_detections, draw_stage_sheet
 

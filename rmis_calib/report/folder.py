@@ -10,9 +10,9 @@ from rmis_calib.config import CalibrationConfig
 from rmis_calib.io import RecordingDescription, atomic_directory, load_recording
 from rmis_calib.io.atomic import write_yaml
 from rmis_calib.io.plain_values import finite_or_none
+from rmis_calib.pipeline.answer.run import CalibrationRun
 from rmis_calib.pipeline.calibration import run_calibration
-from rmis_calib.pipeline.detection import DetectionTable, Progress, View, no_progress
-from rmis_calib.pipeline.run import CalibrationRun
+from rmis_calib.pipeline.pictures.detection import DetectionTable, Progress, View, no_progress
 from rmis_calib.report.detection_pictures import write_picture
 from rmis_calib.report.drawing.frames import overlays, spread
 from rmis_calib.report.drawing.overlays import Overlay

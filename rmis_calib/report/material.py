@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rmis_calib.pipeline.run import CalibrationRun
+from rmis_calib.pipeline.answer.run import CalibrationRun
 from rmis_calib.report.charts.residuals import ResidualFigure, residual_figures
 from rmis_calib.report.charts.signed import residual_evidence
 from rmis_calib.report.drawing.choosing import ShownMotions, choose_motions

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from rmis_calib.io.video_writing import OverlayVideo
-from rmis_calib.pipeline.run import CalibrationRun
+from rmis_calib.pipeline.answer.run import CalibrationRun
 from rmis_calib.report.detection_pictures import playing_rate_hz
 from rmis_calib.report.drawing.frames import overlays
 from rmis_calib.report.drawing.overlays import Overlay

@@ -11,7 +11,7 @@ from rmis_calib.errors import RobotError
 from rmis_calib.io import load_recording, load_robot
 from rmis_calib.kinematics import RobotKinematics
 from rmis_calib.pipeline import run_calibration
-from rmis_calib.pipeline.poses import motion_poses
+from rmis_calib.pipeline.arms.poses import motion_poses
 
 
 def moved(robot, x_mm: float):

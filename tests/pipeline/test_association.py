@@ -12,7 +12,9 @@ import rmis_calib as rc
 from rmis_calib.config import parse_config
 from rmis_calib.errors import InputError
 from rmis_calib.geometry.lines import contour_planes
-from rmis_calib.pipeline.association import (
+from rmis_calib.pipeline.arms.poses import motion_poses
+from rmis_calib.pipeline.calibration import better_choices, run_calibration
+from rmis_calib.pipeline.motions.association import (
     association_gate,
     choices_by_instrument,
     consistent_choice,
@@ -21,8 +23,6 @@ from rmis_calib.pipeline.association import (
     pointed_at,
     read_prior,
 )
-from rmis_calib.pipeline.calibration import better_choices, run_calibration
-from rmis_calib.pipeline.poses import motion_poses
 from rmis_calib.vision import ShaftDetections
 
 RADIUS_MM = 4.0

@@ -4,8 +4,8 @@ import numpy as np
 import torch
 
 from rmis_calib.geometry.lines import contour_planes
-from rmis_calib.pipeline.background import background_candidates, without_background
-from rmis_calib.pipeline.poses import MotionPoses
+from rmis_calib.pipeline.arms.poses import MotionPoses
+from rmis_calib.pipeline.pictures.background import background_candidates, without_background
 from rmis_calib.vision import FrameReason, ShaftDetections
 
 MOTIONS, RADIUS_MM = 60, 4.0

@@ -13,10 +13,10 @@ import rmis_calib as rc
 from rmis_calib.config import parse_config
 from rmis_calib.errors import ObservationsError
 from rmis_calib.geometry.rotations import rotation_angle
-from rmis_calib.pipeline.estimation import estimate_with_kinematics
-from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
-from rmis_calib.pipeline.offset_unknowns import FileUnknowns, estimated_offsets
-from rmis_calib.pipeline.poses import motion_poses
+from rmis_calib.pipeline.answer.estimation import estimate_with_kinematics
+from rmis_calib.pipeline.arms.kinematic_unknowns import KinematicUnknowns
+from rmis_calib.pipeline.arms.offset_unknowns import FileUnknowns, estimated_offsets
+from rmis_calib.pipeline.arms.poses import motion_poses
 from rmis_calib.solver import Problem
 
 CLOCK_S = 0.12

@@ -11,7 +11,7 @@ import yaml
 import data_synth
 import rmis_calib as rc
 from rmis_calib.config import parse_config
-from rmis_calib.pipeline.misfit import SignedResiduals, likely_causes, misfit_message
+from rmis_calib.pipeline.checks.misfit import SignedResiduals, likely_causes, misfit_message
 from rmis_calib.results import Motions, Nuisance
 from rmis_calib.solver.observability import Observability
 

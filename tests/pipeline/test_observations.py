@@ -9,9 +9,9 @@ import data_synth
 import rmis_calib as rc
 from rmis_calib.config import parse_config
 from rmis_calib.errors import ObservationsError
-from rmis_calib.pipeline import observations
-from rmis_calib.pipeline.detection import View
-from rmis_calib.pipeline.poses import motion_poses
+from rmis_calib.pipeline.arms.poses import motion_poses
+from rmis_calib.pipeline.motions import observations
+from rmis_calib.pipeline.pictures.detection import View
 
 
 def test_the_model_error_of_each_camera_is_in_its_own_focal_lengths(tmp_path, monkeypatch):

@@ -13,12 +13,12 @@ import rmis_calib as rc
 from rmis_calib.config import parse_config
 from rmis_calib.geometry.rigid import rigid_inverse
 from rmis_calib.geometry.rotations import matrix_to_rotvec
-from rmis_calib.pipeline import kinematic_unknowns
-from rmis_calib.pipeline.estimation import estimate_with_kinematics
-from rmis_calib.pipeline.found_offsets import poses_at
-from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
-from rmis_calib.pipeline.offsets import _about_offsets, _clock_start
-from rmis_calib.pipeline.poses import motion_poses
+from rmis_calib.pipeline.answer.estimation import estimate_with_kinematics
+from rmis_calib.pipeline.answer.offsets import _about_offsets, _clock_start
+from rmis_calib.pipeline.arms import kinematic_unknowns
+from rmis_calib.pipeline.arms.found_offsets import poses_at
+from rmis_calib.pipeline.arms.kinematic_unknowns import KinematicUnknowns
+from rmis_calib.pipeline.arms.poses import motion_poses
 from rmis_calib.results import KinematicOffsets
 from rmis_calib.solver.solution import Nuisance
 

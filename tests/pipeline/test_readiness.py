@@ -14,7 +14,7 @@ import yaml
 import data_synth
 import rmis_calib as rc
 from rmis_calib.cli import main
-from rmis_calib.pipeline.stereo_order import inverse_depth, looks_swapped
+from rmis_calib.pipeline.checks.stereo_order import inverse_depth, looks_swapped
 
 MOTIONS = 20
 

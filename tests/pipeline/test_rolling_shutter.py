@@ -10,8 +10,8 @@ import data_synth
 import rmis_calib as rc
 from rmis_calib.config import parse_config
 from rmis_calib.geometry.cameras import Camera
+from rmis_calib.pipeline.arms.poses import row_delay_s
 from rmis_calib.pipeline.calibration import run_calibration
-from rmis_calib.pipeline.poses import row_delay_s
 
 QUICK = parse_config({"solver": {"advice": {"motions": 0}, "bias_correction": False, "groups": 0}})
 READOUT_S = 0.02

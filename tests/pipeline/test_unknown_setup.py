@@ -16,11 +16,11 @@ from rmis_calib.errors import RobotError
 from rmis_calib.geometry.rigid import rigid_inverse
 from rmis_calib.geometry.rotations import rotation_angle
 from rmis_calib.io.robot import load_robot, robot_to_dict
-from rmis_calib.pipeline.estimation import estimate_with_kinematics
-from rmis_calib.pipeline.found_offsets import poses_at
-from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
-from rmis_calib.pipeline.observations import setup_observations
-from rmis_calib.pipeline.poses import motion_poses
+from rmis_calib.pipeline.answer.estimation import estimate_with_kinematics
+from rmis_calib.pipeline.arms.found_offsets import poses_at
+from rmis_calib.pipeline.arms.kinematic_unknowns import KinematicUnknowns
+from rmis_calib.pipeline.arms.poses import motion_poses
+from rmis_calib.pipeline.motions.observations import setup_observations
 from rmis_calib.results import CalibrationResult
 
 CONFIG = parse_config({"solver": {"unknowns": {"joint_offsets": "never", "clock": False}}})

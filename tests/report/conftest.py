@@ -13,8 +13,8 @@ import torch
 import data_synth
 import rmis_calib as rc
 from rmis_calib.geometry.rigid import RigidTransform, rigid_exp
+from rmis_calib.pipeline.answer.run import CalibrationRun
 from rmis_calib.pipeline.calibration import run_calibration
-from rmis_calib.pipeline.run import CalibrationRun
 from rmis_calib.report import gather_material, write_report
 from rmis_calib.results import CalibrationResult, Motions
 

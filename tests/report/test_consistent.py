@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from rmis_calib.pipeline.run import CalibrationRun
+from rmis_calib.pipeline.answer.run import CalibrationRun
 from rmis_calib.report import write_report
 from rmis_calib.results import CalibrationResult
 

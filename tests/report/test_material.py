@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rmis_calib.geometry.rigid import RigidTransform
-from rmis_calib.pipeline.run import CalibrationRun
+from rmis_calib.pipeline.answer.run import CalibrationRun
 from rmis_calib.report.charts.residuals import drawn_points, residual_figures
 from rmis_calib.report.charts.signed import residual_evidence
 from rmis_calib.report.drawing.choosing import choose_motions, farthest_apart, typical_spread, worst_apart

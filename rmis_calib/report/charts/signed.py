@@ -13,9 +13,9 @@ from torch import Tensor
 
 from rmis_calib.geometry.cameras import Camera, corrected_point
 from rmis_calib.geometry.lines import contour_planes, point_line_distance
-from rmis_calib.pipeline.association import reversed_direction
-from rmis_calib.pipeline.detection import View
-from rmis_calib.pipeline.run import CalibrationRun
+from rmis_calib.pipeline.answer.run import CalibrationRun
+from rmis_calib.pipeline.motions.association import reversed_direction
+from rmis_calib.pipeline.pictures.detection import View
 from rmis_calib.pipeline.scene import readings_of
 from rmis_calib.report.drawing.predicted import PredictedShaft, in_picture, predict_shaft
 

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rmis_calib.geometry.rigid import transform_points
-from rmis_calib.pipeline.result import TOO_FEW
-from rmis_calib.pipeline.run import CalibrationRun
+from rmis_calib.pipeline.answer.result import TOO_FEW
+from rmis_calib.pipeline.answer.run import CalibrationRun
 from rmis_calib.vision import FrameReason
 
 _APART = 0.1

@@ -8,9 +8,9 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from rmis_calib.geometry.cameras import Camera
-from rmis_calib.pipeline.detection import View
-from rmis_calib.pipeline.result import TOO_FEW
-from rmis_calib.pipeline.run import CalibrationRun
+from rmis_calib.pipeline.answer.result import TOO_FEW
+from rmis_calib.pipeline.answer.run import CalibrationRun
+from rmis_calib.pipeline.pictures.detection import View
 from rmis_calib.pipeline.scene import scene_of
 from rmis_calib.report.drawing.marks import Mark
 from rmis_calib.report.drawing.overlays import Overlay

@@ -10,8 +10,8 @@ from torch import Tensor
 from rmis_calib.geometry.cameras import Camera
 from rmis_calib.geometry.lines import contour_planes
 from rmis_calib.geometry.rigid import rotate_vectors, transform_points
-from rmis_calib.pipeline.detection import View
-from rmis_calib.pipeline.run import CalibrationRun
+from rmis_calib.pipeline.answer.run import CalibrationRun
+from rmis_calib.pipeline.pictures.detection import View
 
 _SAMPLES = 200
 _LEAST_DEPTH_MM = 1.0

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from rmis_calib.pipeline.run import CalibrationRun
+from rmis_calib.pipeline.answer.run import CalibrationRun
 from rmis_calib.pipeline.scene import PlacedCameras, Scene, advised_scene, place_cameras, scene_of
 from rmis_calib.report.drawing.frames import spread
 from rmis_calib.report.drawing.working_point import ellipse

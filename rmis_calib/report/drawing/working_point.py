@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, UInt8
 
 from rmis_calib.geometry.cameras import Camera
-from rmis_calib.pipeline.run import CalibrationRun
+from rmis_calib.pipeline.answer.run import CalibrationRun
 from rmis_calib.pipeline.scene import point_covariance
 from rmis_calib.report.drawing.choosing import largest_residual
 from rmis_calib.report.drawing.frames import overlays

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from rmis_calib.pipeline.observations import ANOTHER_INSTRUMENT, DIRECTION_UNKNOWN
-from rmis_calib.pipeline.result import JOINTS_UNKNOWN, TOO_FEW
+from rmis_calib.pipeline.answer.result import JOINTS_UNKNOWN, TOO_FEW
+from rmis_calib.pipeline.motions.observations import ANOTHER_INSTRUMENT, DIRECTION_UNKNOWN
 from rmis_calib.report.words.formatting import finite, significant
 from rmis_calib.results import STATUS_SENTENCES, CalibrationResult
 from rmis_calib.solver import MotionReason

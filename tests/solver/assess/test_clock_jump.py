@@ -10,7 +10,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 
-from rmis_calib.pipeline.result import consistency_of, judge
+from rmis_calib.pipeline.answer.result import consistency_of, judge
 from rmis_calib.solver import SolverSettings, solve
 from rmis_calib.solver.observability import Verdict
 from rmis_calib.solver.settings import UnknownSettings

@@ -13,12 +13,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rmis_calib.geometry.lines import point_line_distance
-from rmis_calib.pipeline.association import Choice
-from rmis_calib.pipeline.detection import View
-from rmis_calib.pipeline.found_offsets import poses_at_motions
-from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
-from rmis_calib.pipeline.poses import row_delay_s
-from rmis_calib.pipeline.run import CalibrationRun
+from rmis_calib.pipeline.answer.run import CalibrationRun
+from rmis_calib.pipeline.arms.found_offsets import poses_at_motions
+from rmis_calib.pipeline.arms.kinematic_unknowns import KinematicUnknowns
+from rmis_calib.pipeline.arms.poses import row_delay_s
+from rmis_calib.pipeline.motions.association import Choice
+from rmis_calib.pipeline.pictures.detection import View
 
 ROUNDS = 6
 """Solves at most; each brings an answer that the rows spoiled ten times nearer."""

@@ -14,12 +14,12 @@ from torch import Tensor
 
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.geometry.cameras import Camera, corrected_point
-from rmis_calib.pipeline.association import Choice
-from rmis_calib.pipeline.found_offsets import poses_at_motions
-from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
-from rmis_calib.pipeline.observations import ANOTHER_INSTRUMENT
-from rmis_calib.pipeline.run import CalibrationRun
-from rmis_calib.pipeline.stereo_order import looks_swapped, median_inverse_depth
+from rmis_calib.pipeline.answer.run import CalibrationRun
+from rmis_calib.pipeline.arms.found_offsets import poses_at_motions
+from rmis_calib.pipeline.arms.kinematic_unknowns import KinematicUnknowns
+from rmis_calib.pipeline.checks.stereo_order import looks_swapped, median_inverse_depth
+from rmis_calib.pipeline.motions.association import Choice
+from rmis_calib.pipeline.motions.observations import ANOTHER_INSTRUMENT
 from rmis_calib.results import CalibrationResult
 from rmis_calib.solver import MotionReason, SolveStatus
 from rmis_calib.vision import FrameReason, ShaftDetections

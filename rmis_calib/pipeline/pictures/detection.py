@@ -16,8 +16,8 @@ from rmis_calib.config import CalibrationConfig
 from rmis_calib.geometry.cameras import Camera
 from rmis_calib.io import FrameBatch, FrameSource, Recording, load_recording, open_source
 from rmis_calib.pipeline.device import require_device
-from rmis_calib.pipeline.frozen import ChangeMeter
-from rmis_calib.pipeline.masks import MaskReader, open_masks
+from rmis_calib.pipeline.pictures.frozen import ChangeMeter
+from rmis_calib.pipeline.pictures.masks import MaskReader, open_masks
 from rmis_calib.vision import EndKind, FrameReason, ShaftDetections, ShaftDetector
 from rmis_calib.vision.masks import Segmenter
 

@@ -10,12 +10,12 @@ import torch
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.errors import CalibrationFailed, InputError
 from rmis_calib.io import ShaftObservations
-from rmis_calib.pipeline.advice import WHERE, may_advise, pose_candidates, seen_view, with_advice
+from rmis_calib.pipeline.answer.advice import WHERE, may_advise, pose_candidates, seen_view, with_advice
+from rmis_calib.pipeline.answer.offsets import estimate_with_kinematics
+from rmis_calib.pipeline.answer.result import make_result, residual_of, residuals_normalised, used_motions
+from rmis_calib.pipeline.arms.offset_unknowns import FileUnknowns, estimated_offsets, file_unknowns
 from rmis_calib.pipeline.device import require_device
-from rmis_calib.pipeline.observations import problem_of
-from rmis_calib.pipeline.offset_unknowns import FileUnknowns, estimated_offsets, file_unknowns
-from rmis_calib.pipeline.offsets import estimate_with_kinematics
-from rmis_calib.pipeline.result import make_result, residual_of, residuals_normalised, used_motions
+from rmis_calib.pipeline.motions.observations import problem_of
 from rmis_calib.results import CalibrationResult, Motions
 from rmis_calib.solver import Problem, Solution
 from rmis_calib.solver import solve as solve_problem

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.io import Recording, ShaftObservations
-from rmis_calib.pipeline.association import Choice, reversed_direction
-from rmis_calib.pipeline.detection import View
-from rmis_calib.pipeline.poses import MotionPoses
+from rmis_calib.pipeline.arms.poses import MotionPoses
+from rmis_calib.pipeline.motions.association import Choice, reversed_direction
+from rmis_calib.pipeline.pictures.detection import View
 from rmis_calib.pipeline.words import words_of
 from rmis_calib.solver import Problem
 from rmis_calib.vision import FrameReason, ShaftDetections

@@ -15,9 +15,9 @@ from rmis_calib.errors import InputError
 from rmis_calib.geometry import RigidTransform
 from rmis_calib.geometry.lines import point_line_distance
 from rmis_calib.io import Recording
-from rmis_calib.pipeline.detection import View
-from rmis_calib.pipeline.evaluation import read_reference
-from rmis_calib.pipeline.poses import MotionPoses, predict_contours
+from rmis_calib.io.reference import read_reference
+from rmis_calib.pipeline.arms.poses import MotionPoses, predict_contours
+from rmis_calib.pipeline.pictures.detection import View
 from rmis_calib.vision import ShaftDetections
 
 # Share of the motions that must show several shafts at once before instruments are told apart: single false candidates

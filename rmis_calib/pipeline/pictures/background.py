@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from rmis_calib.geometry.rigid import rotate_vectors
-from rmis_calib.pipeline.poses import MotionPoses
+from rmis_calib.pipeline.arms.poses import MotionPoses
 from rmis_calib.vision import FrameReason, ShaftDetections
 
 # Lines of one thing that stands still agree to a pixel; cells of four, normalised units and rad.

@@ -13,8 +13,8 @@ from rmis_calib.geometry.rigid import rigid_inverse
 from rmis_calib.io import Recording
 from rmis_calib.io.recording import log_times_s
 from rmis_calib.kinematics import RobotKinematics
-from rmis_calib.pipeline.offset_unknowns import NO_CLOCK, OffsetUnknowns
-from rmis_calib.pipeline.poses import MotionPoses, poses_of
+from rmis_calib.pipeline.arms.offset_unknowns import NO_CLOCK, OffsetUnknowns
+from rmis_calib.pipeline.arms.poses import MotionPoses, poses_of
 from rmis_calib.solver import Problem
 from rmis_calib.solver.settings import SolverSettings
 

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from rmis_calib.geometry.lines import plane_normal_from_points
 from rmis_calib.geometry.rigid import RigidTransform
-from rmis_calib.pipeline.association import Choice
+from rmis_calib.pipeline.motions.association import Choice
 from rmis_calib.vision import ShaftDetections
 
 _ALONG_BASELINE = 0.3

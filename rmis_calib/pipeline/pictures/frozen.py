@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from rmis_calib.pipeline.poses import MotionPoses
+from rmis_calib.pipeline.arms.poses import MotionPoses
 from rmis_calib.pipeline.words import ranges_in_words
 from rmis_calib.vision import FrameReason, ShaftDetections
 

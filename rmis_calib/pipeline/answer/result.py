@@ -8,11 +8,17 @@ import torch
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.geometry.rigid import RigidTransform
 from rmis_calib.io import Recording
-from rmis_calib.pipeline.association import Choice
-from rmis_calib.pipeline.detection import View
-from rmis_calib.pipeline.observations import reasons_for
-from rmis_calib.pipeline.poses import MotionPoses
-from rmis_calib.pipeline.setup_record import about_compliance, about_setup, given_way, instrument_base_of, setup_of
+from rmis_calib.pipeline.answer.setup_record import (
+    about_compliance,
+    about_setup,
+    given_way,
+    instrument_base_of,
+    setup_of,
+)
+from rmis_calib.pipeline.arms.poses import MotionPoses
+from rmis_calib.pipeline.motions.association import Choice
+from rmis_calib.pipeline.motions.observations import reasons_for
+from rmis_calib.pipeline.pictures.detection import View
 from rmis_calib.pipeline.words import ranges_in_words, words_of
 from rmis_calib.results import (
     INTRINSICS,

@@ -7,9 +7,9 @@ from torch import Tensor
 
 from rmis_calib.geometry.cameras import Camera
 from rmis_calib.io import Recording, ShaftObservations
-from rmis_calib.pipeline.association import Choice
-from rmis_calib.pipeline.detection import View
-from rmis_calib.pipeline.poses import MotionPoses, predict_contours, predict_ends
+from rmis_calib.pipeline.arms.poses import MotionPoses, predict_contours, predict_ends
+from rmis_calib.pipeline.motions.association import Choice
+from rmis_calib.pipeline.pictures.detection import View
 from rmis_calib.results import CalibrationResult
 from rmis_calib.solver import Solution
 

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.io import ShaftObservations
-from rmis_calib.pipeline.observations import problem_of
-from rmis_calib.pipeline.offset_unknowns import NO_CLOCK, OffsetUnknowns, estimated_offsets
+from rmis_calib.pipeline.arms.offset_unknowns import NO_CLOCK, OffsetUnknowns, estimated_offsets
+from rmis_calib.pipeline.motions.observations import problem_of
 from rmis_calib.robot import split_joint_column
 from rmis_calib.solver import Problem, Solution
 from rmis_calib.solver import solve as solve_problem

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.io import Recording
-from rmis_calib.pipeline.association import Choice
-from rmis_calib.pipeline.detection import View
-from rmis_calib.pipeline.poses import MotionPoses
-from rmis_calib.pipeline.stereo_order import looks_swapped, median_inverse_depth
+from rmis_calib.pipeline.arms.poses import MotionPoses
+from rmis_calib.pipeline.checks.stereo_order import looks_swapped, median_inverse_depth
+from rmis_calib.pipeline.motions.association import Choice
+from rmis_calib.pipeline.pictures.detection import View
 from rmis_calib.pipeline.words import joined
 from rmis_calib.robot import split_joint_column
 

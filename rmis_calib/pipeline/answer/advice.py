@@ -21,11 +21,11 @@ from rmis_calib.geometry.cameras import Camera
 from rmis_calib.geometry.rigid import rigid_from_rotation_translation, rigid_inverse
 from rmis_calib.geometry.rotations import rotvec_to_matrix
 from rmis_calib.io import Recording
-from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
-from rmis_calib.pipeline.observations import problem_of
-from rmis_calib.pipeline.offset_unknowns import estimated_offsets
-from rmis_calib.pipeline.result import used_motions
-from rmis_calib.pipeline.run import CalibrationRun
+from rmis_calib.pipeline.answer.result import used_motions
+from rmis_calib.pipeline.answer.run import CalibrationRun
+from rmis_calib.pipeline.arms.kinematic_unknowns import KinematicUnknowns
+from rmis_calib.pipeline.arms.offset_unknowns import estimated_offsets
+from rmis_calib.pipeline.motions.observations import problem_of
 from rmis_calib.pipeline.words import joined
 from rmis_calib.results import INSTRUMENT_BASE
 from rmis_calib.robot import split_joint_column

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rmis_calib.io import Recording
-from rmis_calib.pipeline.kinematic_unknowns import KinematicUnknowns
-from rmis_calib.pipeline.poses import MotionPoses, motion_poses
+from rmis_calib.pipeline.arms.kinematic_unknowns import KinematicUnknowns
+from rmis_calib.pipeline.arms.poses import MotionPoses, motion_poses
 from rmis_calib.results import KinematicOffsets
 from rmis_calib.solver.model.predicted_shaft import rcm_axes
 

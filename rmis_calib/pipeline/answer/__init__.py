@@ -1,0 +1,1 @@
+"""From observations to the answer, with frames, units, a status and advice."""

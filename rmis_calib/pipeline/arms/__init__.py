@@ -1,0 +1,1 @@
+"""Joint logs as poses of both arms, and what joint offsets and the clock change about them."""
