@@ -84,7 +84,8 @@ def smooth(picture: Float[Tensor, "b h w"]) -> Float[Tensor, "b h w"]:
 
     Pictures go as channels of one: as a batch of single channels the same blur takes several times as long on a CPU.
     """
-    return gaussian_blur2d(picture[None], (9, 9), (_BLUR_PX, _BLUR_PX), border_type="replicate")[0]
+    channels = picture.expand(max(2, len(picture)), -1, -1)  # one channel alone goes another way, and is rounded so
+    return gaussian_blur2d(channels[None], (9, 9), (_BLUR_PX, _BLUR_PX), border_type="replicate")[0, : len(picture)]
 
 
 def field_of_view(

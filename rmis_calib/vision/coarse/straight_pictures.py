@@ -3,10 +3,10 @@
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from rmis_calib.vision.coarse.strips import Strips
 from rmis_calib.vision.image.canvas import Canvas
+from rmis_calib.vision.image.sampling import sample_frames
 
 ACROSS, ALONG = 24, 128
 MARGIN = 1.0
@@ -54,19 +54,16 @@ def straighten_pictures(
     across = torch.linspace(MARGIN, -MARGIN, ACROSS, device=rgb.device)
     y = middle[:, :, None] + width[:, :, None] * across[:, None]  # (b, k, across, along)
     place = (strips.points(t[:, :, None].expand_as(y), y) - rgb.new_tensor(canvas.origin)) / canvas.factor
-    # The pictures lie below one another in a tall one, so that all strips are read in one call.
     height, breadth = canvas.size
     u, v = place.unbind(-1)
     u, v = torch.nan_to_num(u), torch.nan_to_num(v)
     inside = (u > -0.5) & (v > -0.5) & (u < breadth - 0.5) & (v < height - 0.5)
-    row = v.clamp(0, height - 1) + (picture * height)[..., None, None]
-    grid = torch.stack([u * (2.0 / (breadth - 1)) - 1, row * (2.0 / (len(rgb) * height - 1)) - 1], -1)
-    layers = torch.cat([rgb, seen[:, None]], 1).movedim(0, 1).reshape(1, 4, -1, breadth)
-    read = grid_sample(layers, grid.flatten(0, 2)[None], mode="bilinear", padding_mode="border", align_corners=True)
-    read = read.reshape(4, -1, ACROSS, ALONG)
+    layers = torch.cat([rgb, seen[:, None]], 1).movedim(0, 1)
+    read = sample_frames(layers, picture, u, v).reshape(4, -1, ACROSS, ALONG)
     known = (inside.reshape(-1, ACROSS, ALONG) & (read[3] > 0.75)).to(rgb.dtype)
     colour = (read[:3] + _FLOOR).log()
-    mean = (colour * known).sum((0, 2, 3)) / (3 * known.sum((1, 2))).clamp(min=1.0)
+    # Summed row by row: over the first axis the order of summation would depend on how many strips there are.
+    mean = (colour * known).movedim(0, 1).flatten(1).sum(1) / (3 * known.sum((1, 2))).clamp(min=1.0)
     colour = (colour - mean[:, None, None]) * known
     columns = width.mean(-1) * (ALONG - 1) / (ends[..., 1] - ends[..., 0]).clamp(min=1.0)
     aspect = 0.5 * columns.clamp(0.5, 200.0).log2().reshape(-1, 1, 1) - 1.5

@@ -88,7 +88,10 @@ class StripNetwork(nn.Module):
 
     def judge(self, strip: Float[Tensor, "m 6 across along"], chord: Float[Tensor, "m 2"]) -> StripVerdict:
         """The logits as a verdict on strips whose first and last columns are these stations."""
-        whole, ends = self(strip)
+        # One strip alone would be convolved by another algorithm, and rounded otherwise than among others.
+        whole, ends = (
+            logits[: len(strip)] for logits in self(strip if len(strip) != 1 else strip.expand(2, -1, -1, -1))
+        )
         share = ends.softmax(1)
         place = share[:, :-2].unflatten(1, (KINDS, ALONG))
         return StripVerdict(whole[:, 0], whole[:, 1], place, share[:, -2], share[:, -1], chord)

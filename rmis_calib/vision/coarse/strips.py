@@ -12,7 +12,7 @@ from torch import Tensor
 
 from rmis_calib.vision.coarse.hough import HoughLines
 from rmis_calib.vision.image.canvas import Canvas
-from rmis_calib.vision.image.sampling import sample
+from rmis_calib.vision.image.sampling import sample_frames
 from rmis_calib.vision.settings import DetectorSettings
 
 
@@ -46,10 +46,7 @@ class SmallPicture:
     def read(
         self, strips: "Strips", t: Float[Tensor, "b k *#points"], y: Float[Tensor, "b k *#points"]
     ) -> tuple[Float[Tensor, "b k *points"], Bool[Tensor, "b k *points"], Float[Tensor, "b k *points"]]:
-        """Unlikeness at (station, lateral) pairs, whether they lie in the field of view, and log brightness.
-
-        The frames lie below one another in one tall picture, so that strips of all of them are read in one call.
-        """
+        """Unlikeness at (station, lateral) pairs, whether they lie in the field of view, and log brightness."""
         height, width = self.canvas.size
         ones = [1] * (max(t.ndim, y.ndim) - 2)
         first = (strips.origin - strips.origin.new_tensor(self.canvas.origin)) / self.factor
@@ -67,8 +64,7 @@ class SmallPicture:
             )
         )
         near = (u >= -0.5) & (v >= -0.5) & (u <= width - 0.5) & (v <= height - 0.5)
-        v = v.clamp_(0, height - 1).add_(strips.frame.reshape(*strips.frame.shape, *ones) * height)
-        unlike, field, tone = sample(self.layers.flatten(1, 2), u, v)
+        unlike, field, tone = sample_frames(self.layers, strips.frame, u, v)
         return unlike, (field > 0.75).logical_and_(near), tone
 
 

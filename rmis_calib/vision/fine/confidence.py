@@ -41,14 +41,20 @@ def features(
         share.clamp(min=0.05).log(),
         (trace.length / reach_px).clamp(min=0.01).log(),
         # Shafts of the real frames reach 0.44 where tissue reflects on them, cavities of tissue start at 0.47.
-        torch.sigmoid((trace.tint - 0.42) / 0.04),
+        _sigmoid((trace.tint - 0.42) / 0.04),
     )
 
 
 def probability(of: tuple[Float[Tensor, "b k"], ...]) -> Float[Tensor, "b k"]:
     """The probability that both lines are a shaft's contours to within three times their uncertainty."""
     weights = of[0].new_tensor(_WEIGHTS)
-    return torch.sigmoid(_BASE + torch.stack(of, -1) @ weights)
+    return _sigmoid(_BASE + (torch.stack(of, -1) * weights).sum(-1))
+
+
+def _sigmoid(x: Float[Tensor, "b k"]) -> Float[Tensor, "b k"]:
+    """As torch's, which computes the last few elements of a tensor otherwise than the rest: a frame must not depend on
+    which others are in its batch."""
+    return 1 / (1 + (-x).exp())
 
 
 def capped(certain: Float[Tensor, "b k"], trace: Trace) -> Float[Tensor, "b k"]:
@@ -70,7 +76,7 @@ def plausible(trace: Trace, fit: LineFit, share: Float[Tensor, "b k"], reach_px:
     contrast = trace.contrast / (trace.contrast + 0.08)
     length = 1 - torch.exp(-1.2 * trace.length / trace.width.clamp(min=1.0))
     # Contours of a cavity wander by a twentieth of its width and more; those of a shaft out of focus by half of that.
-    agreement = 1 / (1 + (fit.wander_px.amax(-1) / (1.0 + 0.035 * trace.width)) ** 4)
+    agreement = 1 / (1 + (fit.wander_px.amax(-1) / (1.0 + 0.035 * trace.width)).square().square())
     border = torch.where(trace.start_at_border, 1.0, 0.45)
     # A short dark bar at the border may be anything; a long one is rarely furniture.
     size = 1 - torch.exp(-trace.length / (0.12 * reach_px))

@@ -174,8 +174,8 @@ def _mean_blur(
     mean = (profile * weight).sum(-2) / weight.sum(-2).clamp(min=1.0)
     bank = offsets.new_tensor(_BLURS)
     columns = step_columns(offsets, bank)  # (n, d, 5)
-    fit = torch.linalg.pinv(columns)
-    residual = mean[..., None, :] - torch.einsum("ndc,nce,bkse->bksnd", columns, fit, mean)
+    explained = columns @ torch.linalg.pinv(columns)  # (n, d, d)
+    residual = mean[..., None, :] - (explained @ mean[..., None, :, None])[..., 0]
     misfit = (residual**2).sum(-1)
     best = misfit.argmin(-1, keepdim=True).clamp(1, len(_BLURS) - 2)
     before, here, after = (misfit.gather(-1, best + shift)[..., 0] for shift in (-1, 0, 1))

@@ -1,9 +1,10 @@
 """Bilinear reading of pictures at many points, for a batch at once."""
 
+import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
@@ -22,6 +23,41 @@ def sample(
     place = place.reshape(1, 1, -1, 2)
     values = grid_sample(layers[None], place, mode="bilinear", padding_mode="border", align_corners=True)
     return values.reshape(layers.shape[0], *u.shape)
+
+
+def sample_frames(
+    layers: Float[Tensor, "c n h w"],
+    frame: Int64[Tensor, "b k"],
+    u: Float[Tensor, "b k *points"],
+    v: Float[Tensor, "b k *points"],
+) -> Float[Tensor, "c b k *points"]:
+    """As `sample`, from several pictures in one call.
+
+    Each picture is read with coordinates of its own, so that its values depend on it alone: rows of one tall picture
+    would be rounded with its height, by 0.01 px in 256 pictures of 720 rows.
+
+    Args:
+        layers: of n pictures.
+        frame: which of them each row of points lies in: row i of n in picture i, or a list (b is not n) in any order.
+        u, v: pixel coordinates.
+    """
+    n, *size = layers.shape[1:]
+    place = torch.stack([u * (2.0 / max(size[1] - 1, 1)) - 1.0, v * (2.0 / max(size[0] - 1, 1)) - 1.0], -1)
+    place = place.reshape(frame.numel(), math.prod(u.shape[2:]), 2)
+    slot, width = (None, frame.shape[1]) if frame.shape[0] == n else _slots(frame.reshape(-1), n)
+    if slot is not None:
+        place = place.new_zeros(n * width, *place.shape[1:]).index_copy_(0, slot, place)
+    place = place.reshape(n, width, place.shape[1], 2)
+    read = grid_sample(layers.movedim(0, 1), place, mode="bilinear", padding_mode="border", align_corners=True)
+    read = read.movedim(1, 0).flatten(1, 2)
+    return (read if slot is None else read.index_select(1, slot)).reshape(len(layers), *u.shape)
+
+
+def _slots(frame: Int64[Tensor, " m"], n: int) -> tuple[Int64[Tensor, " m"], int]:
+    """Places of a list's members in a table with one row a picture, and how wide the table is."""
+    before = (frame[:, None] == torch.arange(n, device=frame.device)).cumsum(0)
+    width = max(1, int(before[-1:].sum(0).max()))
+    return frame * width + before.gather(1, frame[:, None])[:, 0] - 1, width
 
 
 def inside(
