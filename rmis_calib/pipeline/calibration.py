@@ -12,6 +12,7 @@ from rmis_calib.geometry.rigid import RigidTransform
 from rmis_calib.io import Recording, ShaftObservations
 from rmis_calib.pipeline.answer.advice import with_next_motions
 from rmis_calib.pipeline.answer.estimation import estimate, raise_unless_trustworthy
+from rmis_calib.pipeline.answer.motion_names import MotionNames
 from rmis_calib.pipeline.answer.offsets import estimate_with_kinematics
 from rmis_calib.pipeline.answer.result import insufficient_data, make_result, motions_of, residual_of, residuals_px
 from rmis_calib.pipeline.answer.rolling_shutter import with_rows_at_one_instant
@@ -278,8 +279,11 @@ def _solve(
     progress("solving", 1, 1)
     motions = motions_of(recording, views, poses, choices, solution)
     residuals = residuals_px(recording, poses, solution, motions.used)
-    columns = () if unknowns is None else unknowns.columns
-    result = make_result(solution, motions, residuals, config, columns, notes, frame_of(recording))
+    columns, names = (), MotionNames(poses.frames)
+    if unknowns is not None:
+        columns = unknowns.columns
+        names = MotionNames(poses.frames, columns, unknowns.readings_of_motions().cpu().numpy())
+    result = make_result(solution, motions, residuals, config, columns, notes, frame_of(recording), names)
     poses = with_rcm_offset(with_setup(poses, result.kinematic_offsets), result.kinematic_offsets.rcm_mm)
     errors = head_point_errors(result, recording, poses.select(known))
     residuals = result.residuals | {

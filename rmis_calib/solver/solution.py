@@ -104,7 +104,8 @@ class GroupCheck:
         sigmas: length of each shift in the sigmas that noise alone would give it; 6 degrees of freedom.
         growth: factor on the variances of the transform, 1 or more, by direction: covariance -> T covariance T^T.
         inflation: root of the mean factor on the variance.
-        halves: difference of the answers of two halves of the motions, on either side of where they spread most.
+        first_half: whether each group is in the first of two halves, on either side of where motions spread most.
+        halves: difference of the answers of these halves.
         halves_sigmas: the same in their grown sigmas; 6 degrees of freedom.
         change: the clearest difference between what comes before and after some motion; change_sigmas: in sigmas;
             change_at: that motion, the first of a block.
@@ -116,6 +117,7 @@ class GroupCheck:
     sigmas: Float[Tensor, "b k"]
     growth: Float[Tensor, "b 6 6"]
     inflation: Float[Tensor, " b"]
+    first_half: Bool[Tensor, "b k"]
     halves: Float[Tensor, "b 6"]
     halves_sigmas: Float[Tensor, " b"]
     change: Float[Tensor, "b 6"]
@@ -133,6 +135,7 @@ class GroupCheck:
             sigmas=like.new_zeros(b, 0),
             growth=torch.eye(6, dtype=like.dtype, device=like.device).expand(b, 6, 6),
             inflation=torch.ones_like(zero),
+            first_half=torch.zeros(b, 0, dtype=torch.bool, device=like.device),
             halves=like.new_zeros(b, 6),
             halves_sigmas=zero,
             change=like.new_zeros(b, 6),

@@ -8,6 +8,7 @@ import torch
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.geometry.rigid import RigidTransform
 from rmis_calib.io import Recording
+from rmis_calib.pipeline.answer.motion_names import NUMBERED, MotionNames
 from rmis_calib.pipeline.answer.setup_record import (
     about_compliance,
     about_setup,
@@ -19,7 +20,7 @@ from rmis_calib.pipeline.arms.poses import MotionPoses
 from rmis_calib.pipeline.motions.association import Choice
 from rmis_calib.pipeline.motions.observations import reasons_for
 from rmis_calib.pipeline.pictures.detection import View
-from rmis_calib.pipeline.words import ranges_in_words, words_of
+from rmis_calib.pipeline.words import words_of
 from rmis_calib.results import (
     INTRINSICS,
     JOINT_OFFSET,
@@ -64,18 +65,19 @@ def make_result(
     joint_columns: tuple[str, ...] = (),
     notes: tuple[str, ...] = (),
     frame: str | None = None,
+    names: MotionNames = NUMBERED,
 ) -> CalibrationResult:
     """The result of one solve (no trial batch); `joint_columns` name its joint offsets, `notes` join what is said of
-    the data, `frame` is what the motions call `arm` (default: what the solution calls it)."""
+    the data, `frame` is what the motions call `arm` (default: what the solution calls it), `names` are the motions'."""
     frame = frame or solution.frame
-    status, message = judge(solution)
+    status, message = judge(solution, names)
     consistency = consistency_of(solution)
     observability = solution.observability.describe()
     notes = (
         *notes,
         *_about_tool(solution),
         *_about_ends(solution),
-        *about_groups(consistency),
+        *about_groups(consistency, names),
         *about_cameras(solution),
         *about_setup(solution, frame, config.solver.unknowns),
         *about_compliance(solution),
@@ -131,7 +133,7 @@ def _about_ends(solution: Solution) -> tuple[str, ...]:
     )
 
 
-def judge(solution: Solution) -> tuple[Status, str]:
+def judge(solution: Solution, names: MotionNames = NUMBERED) -> tuple[Status, str]:
     """Status and its one line: a solve that did not work first, then a model that does not fit, then sight."""
     status = SolveStatus(int(solution.status))
     verdict = Verdict.of(solution.observability.verdict[0])
@@ -144,11 +146,12 @@ def judge(solution: Solution) -> tuple[Status, str]:
     jump = solution.clock_jump
     if jump is not None and bool(jump.is_clear):
         return "weak", (
-            f"Pictures and joints lose each other: the clock jumps by {float(jump.jump_s):+.3f} s before motion "
-            f"{int(jump.at)}. Likely: frames or samples were lost there; then: the frame rate, or the camera moved"
+            f"Pictures and joints lose each other: the clock jumps by {float(jump.jump_s):+.3f} s before "
+            f"{names.one(int(jump.at))}. Likely: frames or samples were lost there; then: the frame rate, or the "
+            "camera moved"
         )
     if solution.groups is not None and bool(solution.groups.contradicts):
-        return "weak", f"Parts of the data contradict each other: {_contradiction(solution.groups)}"
+        return "weak", f"Parts of the data contradict each other: {_contradiction(solution.groups, names)}"
     name: Status = "ok" if verdict is Verdict.TRUSTWORTHY else verdict.value
     return name, f"{STATUS_SENTENCES[name]}: {solution.observability.describe().sentences[0]}"
 
@@ -261,17 +264,17 @@ def _size(shift: torch.Tensor) -> tuple[float, float]:
     return float(torch.rad2deg(shift[:3].norm())), float(shift[3:].norm())
 
 
-def about_groups(consistency: Consistency | None) -> tuple[str, ...]:
+def about_groups(consistency: Consistency | None, names: MotionNames = NUMBERED) -> tuple[str, ...]:
     """Whether parts of the data disagree by more than noise, in words."""
     if consistency is None or (consistency.inflation or 1.0) < WORTH_SAYING:
         return ()
     worst = int(np.argmax([group.sigmas or 0.0 for group in consistency.groups]))
     group = consistency.groups[worst]
-    where = ranges_in_words(np.flatnonzero(consistency.group_by_motion == worst).tolist())
+    number = consistency.group_by_motion
     return (
         "Groups of neighbouring motions disagree by more than noise explains, so all sigmas were multiplied by "
-        f"{consistency.inflation:.1f}. The {group.motions} motions {where} disagree most: without them the answer "
-        f"moves by {group.rotation_deg:.2g} deg, {group.translation_mm:.2g} mm.",
+        f"{consistency.inflation:.1f}. The {names.some(number == worst, number >= 0)} disagree most: without them the "
+        f"answer moves by {group.rotation_deg:.2g} deg, {group.translation_mm:.2g} mm.",
     )
 
 
@@ -298,17 +301,18 @@ def about_cameras(solution: Solution) -> tuple[str, ...]:
     return (f"The data suggest corrected cameras: {'; '.join(said)}. The transform goes with them.",)
 
 
-def _contradiction(groups: GroupCheck) -> str:
+def _contradiction(groups: GroupCheck, names: MotionNames) -> str:
     """Which parts of the data tell of different transforms."""
     if float(groups.change_sigmas) > CHANGED:
         return (
-            f"the motions before and after motion {int(groups.change_at)} differ by {_apart(groups.change[0])}, "
+            f"the motions before and after {names.one(int(groups.change_at))} differ by {_apart(groups.change[0])}, "
             "more than their sigmas allow: did the camera, a trocar or an arm's base move there?"
         )
+    number, first = groups.group[0].cpu().numpy(), groups.first_half[0].cpu().numpy()
+    half = names.some((number >= 0) & first[number], number >= 0)
     return (
-        f"two halves of the motions, far from each other in joint space, disagree by {_apart(groups.halves[0])}, "
-        "more than their sigmas allow: errors outside the model (lens, focal length, an arm's base, joints) exceed "
-        "the noise"
+        f"the {half} disagree with the rest by {_apart(groups.halves[0])}, more than their sigmas allow: errors "
+        "outside the model (lens, focal length, an arm's base, joints) exceed the noise"
     )
 
 

@@ -93,6 +93,7 @@ def check_groups(fit: MapEstimate, asked: int) -> GroupCheck:
         shift=shift,
         sigmas=(sigmas * own).sum(-1).clamp_min(0.0).sqrt(),
         growth=growth,
+        first_half=first_half > 0.5,
         halves=halves[:, 0],
         halves_sigmas=torch.where(enough, apart[:, 0], 0.0),
         change=torch.take_along_dim(changes, clearest[:, None, None], dim=1)[:, 0],
