@@ -105,7 +105,8 @@ def map_estimate(problem: Problem, settings: SolverSettings, start: "MapEstimate
     fresh = initial_state(nominal, state.R, state.t)
     layout = make_layout(nominal, measured, fresh, settings.unknowns, settings.noise)
     model = WeightedModel(measured, layout, noise, chunk=settings.chunk)
-    state = fresh if start is not None else state
+    if start is not None:  # what the kinematics were evaluated at anew starts from zero, all else from where it was
+        state = replace(state, joint_offset=fresh.joint_offset, clock=fresh.clock, setup=fresh.setup)
     _check_rows(measured)
     state, noise = settle_noise(model, state, order, contaminated, assumed, free, settings, start is None)
     model = replace(model, noise=noise)
