@@ -16,8 +16,9 @@ from rmis_calib.solver.assess.assemble import (
     joint_solution,
     two_step_solution,
 )
-from rmis_calib.solver.assess.evidence import CHANCE, freed, weigh
+from rmis_calib.solver.assess.evidence import CHANCE, weigh
 from rmis_calib.solver.assess.information import motion_information, select_d_optimal
+from rmis_calib.solver.assess.left_out import freed
 from rmis_calib.solver.estimate.map_estimate import map_estimate
 from rmis_calib.solver.estimate.relinearise import Kinematics, solve_relinearised, start_of
 from rmis_calib.solver.model.measurement_rows import pack

@@ -15,7 +15,8 @@ from rmis_calib.pipeline.motions.observations import problem_of
 from rmis_calib.robot import split_joint_column
 from rmis_calib.solver import Problem, Solution
 from rmis_calib.solver import solve as solve_problem
-from rmis_calib.solver.assess.evidence import CHANCE, freed
+from rmis_calib.solver.assess.evidence import CHANCE
+from rmis_calib.solver.assess.left_out import freed
 from rmis_calib.solver.estimate.relinearise import scan_clock
 from rmis_calib.solver.own_measurement import Measurement
 from rmis_calib.solver.settings import SolverSettings

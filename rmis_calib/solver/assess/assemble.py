@@ -9,9 +9,10 @@ from torch import Tensor
 from rmis_calib.geometry.rigid import rigid_exp, rigid_from_rotation_translation, rigid_inverse, rigid_log
 from rmis_calib.geometry.rotations import matrix_to_rotvec
 from rmis_calib.solver.assess.clock_jump import find_clock_jump
-from rmis_calib.solver.assess.evidence import Evidence, reported
+from rmis_calib.solver.assess.evidence import Evidence
 from rmis_calib.solver.assess.groups import check_groups
 from rmis_calib.solver.assess.instrument_base import instrument_base
+from rmis_calib.solver.assess.left_out import reported
 from rmis_calib.solver.assess.observability import assess, detect_degeneracies, turns_about_one_axis
 from rmis_calib.solver.estimate.map_estimate import MapEstimate
 from rmis_calib.solver.estimate.multistart import cheirality

@@ -11,7 +11,7 @@ d_k = (H - H_k)^-1 s_k, one Gauss-Newton step; noise alone would make its covari
 units of the answer's own covariance, W = (sum V_k)^-1/2 (sum d_k d_k^T) (sum V_k)^-1/2 is the identity on average.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -23,6 +23,7 @@ from rmis_calib.solver.estimate.outliers import REJECTED
 from rmis_calib.solver.model.batched_linalg import unit_diagonal
 from rmis_calib.solver.model.measurement_rows import MeasurementRows
 from rmis_calib.solver.model.normal_equations import WeightedModel, member_sums, membership
+from rmis_calib.solver.model.parameters import ParameterLayout
 from rmis_calib.solver.model.state import State
 from rmis_calib.solver.solution import GroupCheck
 
@@ -59,16 +60,12 @@ def check_groups(fit: MapEstimate, asked: int) -> GroupCheck:
     block = torch.arange(measured.motions, device=group.device) * count // measured.motions
     in_time = membership(block.expand_as(group), count, state.t.dtype)
     model, in_full = fit.model, recounted(fit, in_time[0])
-    H_all, s_all = _sums(model, state, torch.cat((membership(group, count, state.t.dtype), in_time), dim=-1))
+    H_all, s_all = sums_of(model, state, torch.cat((membership(group, count, state.t.dtype), in_time), dim=-1))
     H_k, s_k = H_all[:, :count], s_all[:, :count]
-    prior = fit.model.layout.sigma.square().reciprocal()
-    deviation, _ = model.layout.prior(state)
-    H_t, s_t = (H_all[:, count:], s_all[:, count:]) if in_full is model else _sums(in_full, state, in_time)
-    s_k = s_k - (s_k.sum(1) + prior * deviation)[:, None] / count  # what the bias correction left of the score
-    H = H_k.sum(1) + torch.diag_embed(prior)
-    rest = inverse(H[:, None] - H_k)
-    shift = (rest @ s_k[..., None])[..., :6, 0]
-    covariance, covariance_k = inverse(H)[..., :6, :6], rest[..., :6, :6]
+    H_t, s_t = (H_all[:, count:], s_all[:, count:]) if in_full is model else sums_of(in_full, state, in_time)
+    left = leave_groups_out(model.layout, state, H_k, s_k)
+    shift, s_k = left.shift[..., :6], left.score_k
+    covariance, covariance_k = left.covariance[..., :6, :6], left.covariance_k[..., :6, :6]
     told = torch.isfinite(shift).flatten(1).all(-1) & (covariance.diagonal(dim1=-2, dim2=-1) > TINY).all(-1)
     enough = told & enough
     eye = torch.eye(6, dtype=shift.dtype, device=shift.device)
@@ -81,6 +78,7 @@ def check_groups(fit: MapEstimate, asked: int) -> GroupCheck:
     factor, turn = _growth(own, extra)
     factor = torch.where(enough[:, None], factor, 1.0)
     growth = root @ (turn * factor.sqrt()[:, None] @ turn.mT) @ inverse_root
+    deviation, prior = model.layout.prior(state)
     first_half = _first_half(where_motions_are(measured), group, count)
     halves, apart = _difference(H_k, s_k, prior, deviation, first_half[:, None], growth, inverse_root)
     before = torch.tril(torch.ones(count - 1, count, dtype=prior.dtype, device=prior.device)).expand(len(prior), -1, -1)
@@ -101,6 +99,47 @@ def check_groups(fit: MapEstimate, asked: int) -> GroupCheck:
         change_at=first_of_block(measured.motions, count, clearest + 1),
         inflation=factor.mean(-1).sqrt(),
     )
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Estimates without one group of motions each.
+
+    Attributes:
+        score_k: of each group, without its share of what is not zero at the estimate.
+        shift: of all parameters when a group is left out.
+        covariance, covariance_k: of all parameters, with all groups and without each.
+    """
+
+    score_k: Float[Tensor, "b k p"]
+    shift: Float[Tensor, "b k p"]
+    covariance: Float[Tensor, "b p p"]
+    covariance_k: Float[Tensor, "b k p p"]
+
+
+def leave_groups_out(
+    layout: ParameterLayout,
+    state: State,
+    H_k: Float[Tensor, "b k p p"],
+    s_k: Float[Tensor, "b k p"],
+    g: Float[Tensor, "b p"] | None = None,
+) -> LeftOut:
+    """One Gauss-Newton step for each group that is left out.
+
+    Args:
+        layout: the unknowns.
+        state: where the sums were taken.
+        H_k, s_k: information and score of each group, without priors.
+        g: score of all, with priors, where the state is not the estimate: one step away from it.
+    """
+    deviation, prior = layout.prior(state)
+    H = H_k.sum(1) + torch.diag_embed(prior)
+    covariance, rest = inverse(H), inverse(H[:, None] - H_k)
+    if g is not None:
+        step = (covariance @ g[..., None])[..., 0]
+        s_k, deviation = s_k - (H_k @ step[:, None, :, None])[..., 0], deviation - step
+    s_k = s_k - (s_k.sum(1) + prior * deviation)[:, None] / s_k.shape[1]  # what the bias correction left of the score
+    return LeftOut(s_k, (rest @ s_k[..., None])[..., 0], covariance, rest)
 
 
 def groups_of(model: WeightedModel, asked: int) -> tuple[Int[Tensor, "b n"], int, Bool[Tensor, " b"]]:
@@ -136,7 +175,7 @@ def _growth(
     return torch.where(values > _largest_by_chance(own.shape[1]), values, 0.0).maximum(mean), vectors
 
 
-def _sums(
+def sums_of(
     model: WeightedModel, state: State, member: Float[Tensor, "b n k"]
 ) -> tuple[Float[Tensor, "b k p p"], Float[Tensor, "b k p"]]:
     """Information and score of each group, without what is not finite."""
@@ -165,10 +204,14 @@ def neighbours(place: Float[Tensor, "b n d"], used: Tensor, count: int) -> Int[T
         distance = nearer if not centres else torch.minimum(distance, nearer)
         centres.append(centre)
     centre = torch.cat(centres, dim=1)
-    group = used.long()
+    number, group = torch.arange(count, device=place.device), torch.full_like(used, -1, dtype=torch.int64)
     for _ in range(LLOYD_ROUNDS):
-        group = torch.cdist(place, centre).argmin(-1)
-        member = torch.nn.functional.one_hot(group, count).to(place.dtype) * used[..., None]
+        half_squares = 0.5 * centre.square().sum(-1)[:, None]
+        nearest = torch.baddbmm(half_squares, place, centre.mT, alpha=-1.0).argmin(-1)
+        if torch.equal(nearest, group):
+            break
+        group = nearest
+        member = (group[..., None] == number).to(place.dtype) * used[..., None]
         sizes = member.sum(1)
         moved = member.mT @ masked / sizes.clamp_min(1.0)[..., None]
         centre = torch.where(sizes[..., None] > 0, moved, centre)

@@ -108,4 +108,4 @@ def _given_way(measured: MeasurementRows, state: State) -> Float[Tensor, "6 b n"
 def matters(offset: Tensor) -> bool:
     """Whether an offset has an effect, or a derivative. On an accelerator it counts without being looked at: to ask
     waits for everything that is queued, which takes longer than to add zero."""
-    return offset.requires_grad or offset.device.type != "cpu" or bool((offset != 0).any())
+    return offset.requires_grad or offset.device.type != "cpu" or bool(offset.any())
