@@ -66,6 +66,9 @@ class CalibrationConfig:
     instrument_at: tuple[int, float, float] | None = None
     """Frame, and pixel (u, v) of the right camera, on the shaft of the logged instrument, where pictures show several.
     Without it, and without a prior, it is the one that moves with the joints."""
+    look_again: bool = True
+    """Look again, along the contours that a first answer predicts, at pictures that show no shaft there. Not with masks
+    of your own."""
     measurements: tuple[Measurement, ...] = ("axis", "contours", "ends")
     """What the estimate may use of each picture; `heads` are the labelled head points, else kept for evaluation."""
     picture_errors: PictureErrors = field(default_factory=PictureErrors)

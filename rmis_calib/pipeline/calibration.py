@@ -12,6 +12,7 @@ from rmis_calib.geometry.rigid import RigidTransform
 from rmis_calib.io import Recording, ShaftObservations
 from rmis_calib.pipeline.answer.advice import with_next_motions
 from rmis_calib.pipeline.answer.estimation import estimate, raise_unless_trustworthy
+from rmis_calib.pipeline.answer.guided_look import look_along
 from rmis_calib.pipeline.answer.motion_names import MotionNames
 from rmis_calib.pipeline.answer.offsets import estimate_with_kinematics
 from rmis_calib.pipeline.answer.result import insufficient_data, make_result, motions_of, residual_of, residuals_px
@@ -80,7 +81,8 @@ def run_calibration(
     prior = read_prior(config)
     recording, poses = _without_unknown_arm(recording, motion_poses(recording, config.device))
     views, notes = _detect(recording, config, poses, progress, segment)
-    return calibrate_views(recording, config, poses, views, prior, notes, progress)
+    with_pictures = config.look_again and config.masks is None and segment is None
+    return calibrate_views(recording, config, poses, views, prior, notes, progress, with_pictures)
 
 
 def calibrate_views(
@@ -91,6 +93,7 @@ def calibrate_views(
     prior: RigidTransform | None = None,
     notes: tuple[str, ...] = (),
     progress: Progress = no_progress,
+    with_pictures: bool = False,
 ) -> CalibrationRun:
     """The calibration from shafts that are detected already.
 
@@ -102,6 +105,7 @@ def calibrate_views(
         prior: from `read_prior`.
         notes: on what was detected.
         progress: called with (stage, done, total).
+        with_pictures: the views' pictures can be read, to look at them again along what a first answer predicts.
     """
     attempts, several = associate(recording, config, poses, views, prior)
     checked = (*about_motions(recording, poses, config), *about_order(recording, poses, views, attempts[0]))
@@ -109,11 +113,12 @@ def calibrate_views(
     draft = _without_joint_offsets(config)
     run = solve_choices(recording, draft, views, poses, attempts, progress)
     run = _choose_again(run, draft, several, progress)
+    run, about_looks = _look_again(run, draft, several, progress) if with_pictures else (run, ())
     run, about_rows = _with_rows_at_one_instant(run, draft, progress)
     run = _with_joint_offsets(run, config, progress)
     progress("checking", 0, 1)
     run = with_misfit_named(run, config, lambda: _with_cameras_as_given(run, config))
-    run = run.with_notes((*recording.notes, *notes, *about_rows))
+    run = run.with_notes((*recording.notes, *notes, *about_looks, *about_rows))
     run = with_next_motions(run, config)
     progress("checking", 1, 1)
     return run
@@ -184,6 +189,23 @@ def _choose_again(run: CalibrationRun, config: CalibrationConfig, several: bool,
             break
         run = _solve_again(run, config, better, progress)
     return run
+
+
+def _look_again(
+    run: CalibrationRun, config: CalibrationConfig, several: bool, progress: Progress
+) -> tuple[CalibrationRun, tuple[str, ...]]:
+    """The run with what a look at the pictures along its prediction finds, and notes on it."""
+    if run.result.status not in ("ok", "weak"):
+        return run, ()
+    views, notes = look_along(run, config, progress)
+    if not notes:
+        return run, ()
+    looked = replace(run, views=views)
+    choices = better_choices(looked, several)
+    if choices is None:
+        return run, ()
+    again = _choose_again(_solve_again(looked, config, choices, progress), config, several, progress)
+    return (again, notes) if again.result.status in ("ok", "weak") else (run, ())
 
 
 def better_choices(run: CalibrationRun, several: bool) -> tuple[Choice, ...] | None:

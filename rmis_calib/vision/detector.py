@@ -1,35 +1,25 @@
 """The shaft detector: pictures in, contour lines, axis and shaft end out, with uncertainty and a reason per frame."""
 
-import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from rmis_calib.errors import ShapeError
-from rmis_calib.geometry import Camera, axis_from_contours, plane_normal_from_points
-from rmis_calib.vision.coarse.search import SearchTrace, StripCandidates, search
-from rmis_calib.vision.coarse.strips import Strips
-from rmis_calib.vision.coarse.trace import Trace
+from rmis_calib.geometry import Camera
+from rmis_calib.vision.coarse.search import SearchTrace, StripCandidates, search, trace_along
+from rmis_calib.vision.coarse.strips import between
 from rmis_calib.vision.detections import EndKind, FrameReason, ShaftDetections, merge, needs_second_pass
-from rmis_calib.vision.fine import confidence, edges, ends
+from rmis_calib.vision.fine.expected import where_expected
+from rmis_calib.vision.fine.measurement import measure
 from rmis_calib.vision.image.canvas import Canvas, plan_canvas
-from rmis_calib.vision.image.line_fit import LineFit, fit_lines
 from rmis_calib.vision.image.pixel_mapping import Lens
-from rmis_calib.vision.image.run_length import masked_median, smooth_over
-from rmis_calib.vision.image.sampling import FullPicture
 from rmis_calib.vision.masks import checked_masks
 from rmis_calib.vision.settings import DetectorSettings
 
-_POLYLINE = 24
-_STRETCHES = 8
 _LEADS = 3
 """Strips beyond the sure shafts that ask for a second look: the fourth best of an operating scene is tissue."""
-# Shading, blood and compression move points together over more than the blocks from which a line's uncertainty is
-# estimated: of factors from 1 to 2 this one makes the errors of the presets most likely.
-_LONG_ERRORS = 1.6
 
 
 class ShaftDetector:
@@ -80,6 +70,37 @@ class ShaftDetector:
         for name, value in vars(found).items():
             value[again] = getattr(better, name)
         return found
+
+    def look_along(self, images: Tensor, contour_n: Float[Tensor, "b 2 3"]) -> ShaftDetections:
+        """The shaft of each picture near where it is expected: one candidate a frame.
+
+        Its contours are followed along the expected ones, however much tissue, blood or glare hides in between. It is
+        valid where the measured lines lie near the expected ones, which by chance they hardly do; the confidence counts
+        that.
+
+        Args:
+            images: as in `detect`.
+            contour_n: normals of both contours' planes, as `geometry.contour_planes` gives them.
+
+        Raises:
+            ShapeError: as in `detect`, or not two contours a picture.
+        """
+        images, _, broken = self._prepared(images, None)
+        if contour_n.shape != (len(images), 2, 3):
+            raise ShapeError(where="contour_n", expected=f"({len(images)}, 2, 3)", found=tuple(contour_n.shape))
+        expected = contour_n.to(images.device, torch.float32)
+        with torch.inference_mode():
+            canvas = self._canvas(images)
+            strip = between(self.lens.to_ideal_lines(expected), canvas)
+            found = trace_along(images, canvas, self.settings, strip)
+            strips = measure(images, found, self.lens, self.settings)
+            clear = strips.clear & (found.scores > 0)[found.keep]
+            fields = strips.fields(clear, strips.certain, self.lens, self.settings)
+            fields = {name: _spread(value, found.keep) for name, value in fields.items()}
+            both = ShaftDetections(reason=torch.zeros(len(images), dtype=torch.int64, device=images.device), **fields)
+            width = _spread(strips.trace.width, found.keep) / self.lens.focal_px
+            looked = where_expected(both, expected, width, broken, self.settings.min_confidence)
+        return ShaftDetections(**{name: value.clone() for name, value in vars(looked).items()})
 
     def explain(self, images: Tensor, masks: Tensor | None = None) -> tuple[ShaftDetections, SearchTrace]:
         """Shafts looked for in both views, and what each stage of the coarse search saw. Arguments and errors as in
@@ -136,100 +157,13 @@ class ShaftDetector:
         self, images: Tensor, found: StripCandidates, stages: SearchTrace, broken: Bool[Tensor, " b"]
     ) -> ShaftDetections:
         """Sub-pixel contours, axis and end of the traced strips."""
-        trace, keep, scores = found.trace, found.keep, found.scores
-        decoded = images.contiguous(memory_format=torch.channels_last)  # a copy only of planar pictures
-        picture = FullPicture(decoded, found.frame, self.lens)
-        points, fit = self._contours(picture, trace)
-        strips = replace(trace.strips, offset=fit.offset, slope=fit.slope)
-        expected = ends.expect(found.verdict, trace)
-        floor, blur = 5 * self.settings.sigma_floor_px, points.blur_px.mean(-1)
-        end = ends.locate(picture, strips, expected.t, expected.reach_px, trace.width, blur, floor)
-        offered = edges.at_stations(trace.sides, trace.t, points.t)
-        share = (fit.inliers / offered.sum(-1).clamp(min=1)).amin(-1)
-        reach = math.hypot(*images.shape[-2:])
-        certain = confidence.capped(confidence.probability(confidence.features(trace, fit, share, reach)), trace)
-        convergence = (fit.slope[..., 0] - fit.slope[..., 1]).abs()
-        cylinder = convergence < math.tan(math.radians(self.settings.max_convergence_deg))
-        clear = cylinder & (share > 0.15) & ((scores > 0) & ~broken[:, None])[keep] & (fit.spread_t.amin(-1) > 0)
-        plausible = confidence.plausible(trace, fit, share, reach)
-        valid = clear & plausible & (certain >= self.settings.min_confidence)
-        measured = self._assemble(trace, strips, points, fit, end, expected, valid, certain)
-        reason = _reason(stages, scores, _spread(clear, keep), _spread(valid, keep), broken)
-        fields = {name: _spread(value, keep) for name, value in measured.items()}
+        strips = measure(images, found, self.lens, self.settings)
+        clear = strips.clear & ((found.scores > 0) & ~broken[:, None])[found.keep]
+        valid = clear & strips.plausible & (strips.certain >= self.settings.min_confidence)
+        fields = strips.fields(valid, strips.certain, self.lens, self.settings)
+        fields = {name: _spread(value, found.keep) for name, value in fields.items()}
+        reason = _reason(stages, found.scores, _spread(clear, found.keep), fields["valid"], broken)
         return ShaftDetections(reason=reason, **fields).surest_first()
-
-    def _contours(self, picture: FullPicture, trace: Trace) -> tuple[edges.EdgePoints, LineFit]:
-        """Edge points found roughly, then finely, and the lines through them."""
-        settings, strips = self.settings, trace.strips
-        t = edges.place_samples(trace.on, trace.t, settings.edge_samples)
-        lateral = edges.interpolate(trace.lateral, trace.t, t)
-        step = torch.full_like(strips.offset, max(1.0, picture.images.shape[-1] / settings.small_width_px / 3))
-        both = t[:, :, None].expand_as(lateral)
-        use = edges.at_stations(trace.sides, trace.t, t)
-        points = edges.rough(picture, strips, t, lateral, use, step)
-        main = edges.at_stations(trace.main[:, :, None], trace.t, t).expand_as(both)
-        # Beyond that a point belongs to something else: tissue, a stain, the edge of a stripe of glare.
-        tolerance = 0.3 * points.blur_px + 0.01 * trace.width[..., None]
-        line = fit_lines(both, points.lateral, points.valid.to(t.dtype), main, tolerance, 0.01)
-        straight = line.offset[..., None] + line.slope[..., None] * both
-        near = points.valid & ((points.lateral - straight).abs() < 4 * line.scatter_px[..., None])
-        centre = straight + smooth_over(points.lateral - straight, near)
-        points = edges.fine(picture, strips, t, centre, use, (points.blur_px / 1.3).clamp(1.0, 4.0))
-        usual = masked_median(points.height, points.valid)[..., None].clamp(min=1e-6)
-        weight = points.valid * (points.height / usual).clamp(0.3, 1.5)
-        return points, fit_lines(both, points.lateral, weight, main, tolerance, 0.01)
-
-    def _assemble(
-        self,
-        trace: Trace,
-        strips: Strips,
-        points: edges.EdgePoints,
-        fit: LineFit,
-        end: ends.ShaftEnd,
-        expected: ends.ExpectedEnd,
-        valid: Bool[Tensor, "b k"],
-        certain: Float[Tensor, "b k"],
-    ) -> dict[str, Tensor]:
-        """The fields of `ShaftDetections`, but for the reason."""
-        focal = self.lens.focal_px
-        along = torch.stack([fit.centre_t - fit.spread_t, fit.centre_t + fit.spread_t], -1)  # (b, k, 2, 2)
-        lateral = fit.offset[..., None] + fit.slope[..., None] * along
-        contour = self._normalised(strips.points(along, lateral))
-        middle = strips.contour(end.t[..., None]).mean(2)
-        end_ideal = strips.points(end.t[..., None], middle)[:, :, 0]
-        axis, end_xy = _axis(contour, self._normalised(end_ideal), self.lens.camera is not None)
-        stop = torch.where(end.valid, end.t, trace.end)
-        share = torch.linspace(0, 1, _POLYLINE, device=stop.device)
-        t = trace.start[..., None] + (stop - trace.start)[..., None] * share
-        polyline = strips.points(t[:, :, None].expand(-1, -1, 2, -1), strips.contour(t))
-        straight, t_block = points.bend(fit, _STRETCHES)
-        place = t_block[:, :, None].expand(-1, -1, 2, -1)
-        sigma = ((_LONG_ERRORS * fit.sigma_px).square() + self.settings.sigma_floor_px**2).sqrt() / focal
-        known = trace.start_at_border & ~trace.end_at_border
-        end_valid = end.valid & valid & expected.in_view
-        return dict(
-            valid=valid,
-            contour_xy=_only(valid, contour),
-            contour_sigma=_only(valid, sigma),
-            axis_xy=_only(valid, axis),
-            axis_sigma=_only(valid, 0.5 * sigma.square().sum(-1).sqrt()),
-            end_xy=_only(end_valid, end_xy),
-            end_sigma=_only(end_valid, end.sigma_px / focal),
-            end_valid=end_valid,
-            end_kind=torch.where(valid, expected.kind, int(EndKind.UNKNOWN)),
-            end_sureness=_only(valid, expected.sureness),
-            direction_known=known & valid,
-            confidence=_only(valid, certain),
-            contour_uv=_only(valid, self.lens.to_raw(polyline)),
-            end_uv=_only(end_valid, self.lens.to_raw(end_ideal)),
-            scatter_px=_only(valid, fit.scatter_px),
-            straight_px=_only(valid, straight),
-            straight_uv=_only(valid, self.lens.to_raw(strips.points(place, strips.contour(t_block)))),
-            blur_px=_only(valid, points.blur_px),
-        )
-
-    def _normalised(self, ideal: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
-        return self.lens.normalise(ideal)
 
 
 def _spread(listed: Tensor, keep: Bool[Tensor, "b k"]) -> Tensor:
@@ -238,35 +172,6 @@ def _spread(listed: Tensor, keep: Bool[Tensor, "b k"]) -> Tensor:
     dense = torch.full((*keep.shape, *listed.shape[2:]), empty, dtype=listed.dtype, device=listed.device)
     dense[keep] = listed[0]
     return dense
-
-
-def _only(mask: Bool[Tensor, "b k"], value: Float[Tensor, "b k ..."]) -> Float[Tensor, "b k ..."]:
-    """The value where the mask holds, NaN elsewhere."""
-    return torch.where(mask.reshape(*mask.shape, *[1] * (value.ndim - 2)), value, torch.nan)
-
-
-def _axis(
-    contour: Float[Tensor, "b k 2 2 2"], end: Float[Tensor, "b k 2"], calibrated: bool
-) -> tuple[Float[Tensor, "b k 2 2"], Float[Tensor, "b k 2"]]:
-    """Two points of the axis line, and the end moved from the rim that is seen to the axis behind it.
-
-    In the plane of the axis the rim is nearer than the axis by the factor 1 - sin(half angle), at the same place along
-    the axis.
-    """
-    middle = contour.mean(2)  # mean of the edges at either point
-    if not calibrated:
-        return middle, end
-    normals = plane_normal_from_points(contour[..., 0, :], contour[..., 1, :])
-    plane = axis_from_contours(normals, 1.0)
-    n = plane.camera_n_axis
-    size = n[..., :2].square().sum(-1).clamp(min=1e-12)
-    off = ((middle * n[..., None, :2]).sum(-1) + n[..., None, 2]) / size[..., None]
-    axis = middle - off[..., None] * n[..., None, :2]
-    along = torch.linalg.cross(n, plane.camera_u)
-    ray = torch.cat([end, torch.ones_like(end[..., :1])], -1)
-    depth, shift = (ray * plane.camera_u).sum(-1), (ray * along).sum(-1)
-    on_axis = plane.camera_u * depth[..., None] + along * (shift * (1 - plane.half_angle_rad.sin()))[..., None]
-    return axis, on_axis[..., :2] / on_axis[..., 2:]
 
 
 def _reason(stages: SearchTrace, scores: Tensor, clear: Tensor, valid: Tensor, broken: Tensor) -> Int[Tensor, " b"]:

@@ -12,6 +12,7 @@ import rmis_calib as rc
 from rmis_calib.config import parse_config
 from rmis_calib.errors import InputError
 from rmis_calib.geometry.lines import contour_planes
+from rmis_calib.pipeline.answer.guided_look import look_along
 from rmis_calib.pipeline.arms.poses import motion_poses
 from rmis_calib.pipeline.calibration import better_choices, run_calibration
 from rmis_calib.pipeline.motions.association import (
@@ -23,6 +24,7 @@ from rmis_calib.pipeline.motions.association import (
     pointed_at,
     read_prior,
 )
+from rmis_calib.pipeline.pictures.detection import no_progress
 from rmis_calib.vision import ShaftDetections
 
 RADIUS_MM = 4.0
@@ -201,6 +203,29 @@ def test_the_instrument_that_moves_with_the_joints_is_the_one_that_calibrates(tm
     assert run.result.motions.used.sum() > 25
     check_what_is_known_beforehand(recording, run, config, folder)
     check_an_answer_that_is_open_still_chooses(run)
+    check_a_look_along_the_prediction(run, config)
+
+
+def check_a_look_along_the_prediction(run, config):
+    """Every other frame's candidates are taken away; a right answer finds its own again, a wrong one nothing."""
+    blank = []
+    for view in run.views:
+        valid = view.detections.valid.clone()
+        valid[::2] = False
+        blank.append(replace(view, detections=replace(view.detections, valid=valid)))
+    run = replace(run, views=tuple(blank))
+    views, notes = look_along(run, config, no_progress)
+    wrong = run.result.camera_right_T_arm.matrix.clone()
+    wrong[:3, 3] += torch.tensor([10.0, 0.0, 0.0])
+    wrong = replace(run.result.camera_right_T_arm, matrix=wrong)
+    astray, _ = look_along(replace(run, result=replace(run.result, camera_right_T_arm=wrong)), config, no_progress)
+    for view, before, off in zip(views, blank, astray, strict=True):
+        shown = view.detections.valid[::2]
+        assert float(shown.any(-1).double().mean()) > 0.8
+        assert torch.equal(view.detections.valid[1::2], before.detections.valid[1::2])
+        if view.side == "right":
+            assert float(off.detections.valid[::2].any(-1).double().mean()) < 0.1
+    assert [note.split(":")[0] for note in notes] == ["camera_right", "camera_left"]
 
 
 def check_an_answer_that_is_open_still_chooses(run):

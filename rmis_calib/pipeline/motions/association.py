@@ -232,6 +232,11 @@ def pointed_at(detections: ShaftDetections, xy: Float[Tensor, " 2"]) -> int:
     return int(off.argmin()) if bool(torch.isfinite(off).any()) else -1
 
 
+def distance_to(detections: ShaftDetections, predicted_n_contour: Float[Tensor, "m 2 3"]) -> Float[Tensor, "m k"]:
+    """How far candidates lie from a prediction, normalised units; infinite for none."""
+    return _distances(detections, predicted_n_contour)[0]
+
+
 def _distances(
     detections: ShaftDetections, predicted_n_contour: Float[Tensor, "m 2 3"]
 ) -> tuple[Float[Tensor, "m k"], Bool[Tensor, "m k"]]:

@@ -70,6 +70,37 @@ class StripCandidates:
     """Of the network on the kept ones, one list (m)."""
 
 
+@dataclass(frozen=True, eq=False)
+class SmallViews:
+    """A batch of pictures made small, in the views of `appearance.shaft_contrast`."""
+
+    rgb: Float[Tensor, "b 3 h w"]
+    seen: Bool[Tensor, "b h w"]
+    well_inside: Bool[Tensor, "b h w"]
+    """`seen` without a rim along black borders."""
+    views: Float[Tensor, "b views h w"]
+    picture: strips.SmallPicture
+
+
+def small_views(
+    images: Tensor, canvas: Canvas, settings: DetectorSettings, looks: int, masks: Tensor | None = None
+) -> SmallViews:
+    """What strips are looked for on. Arguments as in `search`."""
+    small = shrink(images, canvas.factor)
+    field, within = appearance.field_of_view(small, settings.black_level, _RIM_PX)
+    rgb, seen, well_inside = _lay_out(canvas, small, field, within)
+    if masks is None:
+        views, tone = appearance.shaft_contrast(rgb, seen, looks)
+    else:
+        inside = canvas.lay_out(shrink(masks[:, None].to(torch.float32), canvas.factor))
+        views, tone = appearance.smooth(1 - inside[:, 0])[:, None], torch.zeros_like(inside[:, 0])
+    # Each view is searched as a frame of its own, until the best strips of each picture are chosen.
+    count = views.shape[1]
+    unlike, around, tones = (views.flatten(0, 1), *(layer.repeat_interleave(count, 0) for layer in (seen, tone)))
+    layers = torch.stack([unlike, around.to(unlike.dtype), tones])
+    return SmallViews(rgb, seen, well_inside, views, strips.SmallPicture(layers, count, canvas, images.shape[-1]))
+
+
 def search(
     images: Tensor,
     canvas: Canvas,
@@ -86,47 +117,51 @@ def search(
         looks: views of each picture that are searched, 1 or 2 (appearance.py); masks are a single one.
         masks: (b, H, W), 1 on shafts, which replace the colour stage.
     """
-    small = shrink(images, canvas.factor)
-    field, within = appearance.field_of_view(small, settings.black_level, _RIM_PX)
-    rgb, seen, well_inside = _lay_out(canvas, small, field, within)
-    if masks is None:
-        views, tone = appearance.shaft_contrast(rgb, seen, looks)
-    else:
-        inside = canvas.lay_out(shrink(masks[:, None].to(torch.float32), canvas.factor))
-        views, tone = appearance.smooth(1 - inside[:, 0])[:, None], torch.zeros_like(inside[:, 0])
-    # Each view is searched as a frame of its own, until the best strips of each picture are chosen.
-    count = views.shape[1]
-    unlike, around, well_inside, tones = (
-        views.flatten(0, 1),
-        *(layer.repeat_interleave(count, 0) for layer in (seen, well_inside, tone)),
-    )
-    ridge, edges = _edges(unlike, well_inside)
+    small = small_views(images, canvas, settings, looks, masks)
+    picture, views, count = small.picture, small.views, small.picture.views
+    unlike = views.flatten(0, 1)
+    ridge, edges = _edges(unlike, small.well_inside.repeat_interleave(count, 0))
     votes = hough.vote(edges, len(unlike), canvas.half_diagonal_px / canvas.factor + 2)
     lines = hough.refine(edges, hough.peaks(votes, _LINES))
-    layers = torch.stack([unlike, around.to(unlike.dtype), tones])
-    picture = strips.SmallPicture(layers, count, canvas, images.shape[-1])
     lines = hough.HoughLines(lines.normal, lines.rho * canvas.factor, lines.votes)
     # Masks have no texture: a strip that is too wide looks as good at a glance as the right one, so none is left out.
     count_pairs = _STRIPS if masks is None else _PAIRS
     pairs = scoring.screen(picture, strips.pair(lines, picture, settings, _PAIRS), settings, count_pairs)
     evidence = scoring.inspect(picture, pairs, settings)
     scores = scoring.score(evidence, settings)
-    look = partial(_look_along, rgb, seen, picture)
+    look = partial(_look_along, small)
     found = _best(picture, evidence, scores, settings, look)
     ridge, votes = ridge.unflatten(0, (-1, count)).any(1), votes.unflatten(0, (-1, count)).amax(1)
     lines = hough.HoughLines(**{n: v.unflatten(0, (-1, count)).flatten(1, 2) for n, v in vars(lines).items()})
     evidence, scores = evidence.views_together(count), scores.unflatten(0, (-1, count)).flatten(1, 2)
-    pictures = (rgb, seen, views[:, 0], views[:, -1], ridge, votes)
+    pictures = (small.rgb, small.seen, views[:, 0], views[:, -1], ridge, votes)
     return found, SearchTrace(*pictures, lines, evidence, scores, found.scores, canvas.factor, canvas.origin)
 
 
-def _look_along(
-    rgb: Float[Tensor, "n 3 h w"], seen: Bool[Tensor, "n h w"], picture: strips.SmallPicture, several: strips.Strips
-) -> StripVerdict:
+def trace_along(images: Tensor, canvas: Canvas, settings: DetectorSettings, expected: strips.Strips) -> StripCandidates:
+    """Contours near strips where a shaft is expected, one a picture, traced in both views; ranks are the views.
+
+    Whether one is there is left to who measures them: nothing is ranked or left out here.
+    """
+    small = small_views(images, canvas, settings, 2)
+    picture = small.picture
+    each = {name: value.repeat_interleave(picture.views, 0) for name, value in vars(expected).items()}
+    view = torch.arange(len(each["frame"]), device=expected.frame.device)
+    several = strips.Strips(**each | {"frame": view[:, None]}).listed(torch.ones_like(each["valid"]))
+    straight, _ = trace.straighten(trace.trace(picture, several, settings))
+    traced = trace.trace(picture, straight, settings)
+    keep = each["valid"].reshape(-1, picture.views)
+    scores = keep.to(traced.width.dtype)
+    everywhere = torch.ones_like(keep)
+    return StripCandidates(traced, view[None] // picture.views, everywhere, scores, _look_along(small, traced.strips))
+
+
+def _look_along(small: SmallViews, several: strips.Strips) -> StripVerdict:
     """What the network says of strips in any of the views; places of ends as stations, px."""
-    number = several.frame // picture.views
-    straight, chord = straighten_pictures(rgb, seen.to(rgb.dtype), picture.canvas, several, number)
-    return load_network(rgb.device).judge(straight, chord.flatten(0, 1))
+    number = several.frame // small.picture.views
+    seen = small.seen.to(small.rgb.dtype)
+    straight, chord = straighten_pictures(small.rgb, seen, small.picture.canvas, several, number)
+    return load_network(small.rgb.device).judge(straight, chord.flatten(0, 1))
 
 
 def _best(

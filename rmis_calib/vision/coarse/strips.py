@@ -128,6 +128,33 @@ class Strips:
         )
 
 
+def between(lines: Float[Tensor, "b 2 3"], canvas: Canvas) -> Strips:
+    """The strip between two lines of each picture: the left one and the right one of a direction.
+
+    Args:
+        lines: a u + b v + c = 0 in ideal pixels, positive to the right of that direction.
+        canvas: whose middle the stations count from.
+    """
+    lines = lines / lines[..., :2].norm(dim=-1, keepdim=True)
+    normal = torch.nn.functional.normalize(lines[..., :2].sum(1), dim=-1)  # to the right
+    along = torch.stack([normal[..., 1], -normal[..., 0]], -1)
+    centre = lines.new_tensor(canvas.centre)
+    across = -(lines[..., :2] * normal[:, None]).sum(-1)
+    offset = -((lines[..., :2] * centre).sum(-1) + lines[..., 2]) / across
+    slope = -(lines[..., :2] * along[:, None]).sum(-1) / across
+    middle = offset.mean(-1, keepdim=True)
+    frame = torch.arange(len(lines), device=lines.device)[:, None]
+    valid = torch.isfinite(offset).all(-1, keepdim=True) & (offset[:, :1] > offset[:, 1:])
+    return Strips(
+        frame=frame,
+        origin=(centre - middle * normal)[:, None],
+        along=along[:, None],
+        offset=torch.nan_to_num(offset - middle)[:, None],
+        slope=torch.nan_to_num(slope)[:, None],
+        valid=valid,
+    )
+
+
 def pair(lines: HoughLines, picture: SmallPicture, settings: DetectorSettings, count: int) -> Strips:
     """Up to `count` most voted pairs of lines that could be the contours of one cylinder.
 

@@ -49,6 +49,12 @@ class Lens:
         focal, centre = self._intrinsics(ideal)
         return (ideal - centre) / focal
 
+    def to_ideal_lines(self, lines: Float[Tensor, "*lines 3"]) -> Float[Tensor, "*lines 3"]:
+        """Lines a x + b y + c = 0 in normalised undistorted coordinates, as lines in ideal pixels of the same sides."""
+        focal, centre = self._intrinsics(lines)
+        normal = lines[..., :2] / focal
+        return torch.cat([normal, lines[..., 2:] - (normal * centre).sum(-1, keepdim=True)], -1)
+
     def to_raw(self, ideal: Float[Tensor, "*points 2"]) -> Float[Tensor, "*points 2"]:
         """Ideal pixels to raw pixels."""
         if self.camera is None or not self.distorts:
