@@ -9,6 +9,7 @@ _EXPORTS = {
     "SynthConfig": "settings",
     "SideTruth": "truth",
     "load_synth_config": "presets",
+    "paint_strips": "strips",
     "render_bench": "bench",
     "render_frames": "render",
     "simulate_lines": "lines",

@@ -1,6 +1,10 @@
 """Straight pictures of strips lie where they should, and the network that looks along them is small and sees shafts."""
 
+import hashlib
+import json
+import sys
 from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,9 +13,13 @@ import torch
 from data_synth import render_bench
 from rmis_calib.vision import DetectorSettings, EndKind, ShaftDetector
 from rmis_calib.vision.coarse.straight_pictures import ACROSS, ALONG, straighten_pictures
-from rmis_calib.vision.coarse.strip_network import StripNetwork, StripVerdict, load_network
+from rmis_calib.vision.coarse.strip_network import StripNetwork, StripVerdict, load_network, made_by
 from rmis_calib.vision.coarse.strips import Strips
 from rmis_calib.vision.image.canvas import Canvas
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+import labelled_strips
+import train_strip_network as trainer
 
 
 def strips_through(contours: torch.Tensor, centre: torch.Tensor) -> Strips:
@@ -86,7 +94,48 @@ def test_the_network_is_small():
     file = files("rmis_calib.vision.coarse") / "strip_network.npz"
     assert len(file.read_bytes()) < 400_000
     with file.open("rb") as stream, np.load(stream) as weights:
-        assert {weights[name].dtype for name in weights.files} == {np.dtype(np.float16)}
+        own = {name: weights[name] for name in weights.files if name != "made_by"}
+        assert {w.dtype for w in own.values()} == {np.dtype(np.float16)}
+    assert sum(w.size for w in own.values()) <= 150_000
+
+
+def test_the_weights_say_what_they_were_made_by():
+    made = made_by()
+    assert (Path(__file__).resolve().parents[2] / made["script"]).is_file()
+    assert 1 <= made["version"] <= trainer.VERSION
+    digest = hashlib.sha256(json.dumps(made["settings"], sort_keys=True).encode()).hexdigest()
+    assert made["settings_sha256"] == digest
+    assert made["seed"] == made["settings"]["seed"]
+
+
+@pytest.fixture
+def settled():
+    """Threads and algorithms as the script has them, and afterwards as they were."""
+    threads, strict = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
+    trainer.settle()
+    yield
+    torch.set_num_threads(threads)
+    torch.use_deterministic_algorithms(strict)
+
+
+def short_training(seed: int) -> dict[str, torch.Tensor]:
+    pictures = torch.rand(2, 3, 60, 80, generator=torch.Generator().manual_seed(seed))
+    settings = trainer.Training(seed=seed, steps=6, batch=24)
+    return trainer.train(trainer.painted(seed, pictures, 64), settings).state_dict()
+
+
+def test_two_short_trainings_with_one_seed_give_the_same_weights(settled):
+    first, again, other = short_training(1), short_training(1), short_training(2)
+    assert all(torch.equal(w, again[name]) for name, w in first.items())
+    assert not all(torch.equal(w, other[name]) for name, w in first.items())
+
+
+def test_scenes_and_benches_give_the_same_strips_again(settled, monkeypatch):
+    monkeypatch.setattr(labelled_strips, "FRAMES", 2)
+    for strips in (lambda: trainer.of_world(7, 0, trainer.TRAINED_ON), lambda: trainer.of_benches(7, 0)):
+        first, again = strips(), strips()
+        assert len(first.end) > 5
+        assert all(torch.equal(value, getattr(again, name)) for name, value in vars(first).items())
 
 
 def test_an_end_is_the_mean_of_the_columns_about_the_likeliest():

@@ -61,11 +61,19 @@ def straighten_pictures(
     layers = torch.cat([rgb, seen[:, None]], 1).movedim(0, 1)
     read = sample_frames(layers, picture, u, v).reshape(4, -1, ACROSS, ALONG)
     known = (inside.reshape(-1, ACROSS, ALONG) & (read[3] > 0.75)).to(rgb.dtype)
-    colour = (read[:3] + _FLOOR).log()
-    # Summed row by row: over the first axis the order of summation would depend on how many strips there are.
-    mean = (colour * known).movedim(0, 1).flatten(1).sum(1) / (3 * known.sum((1, 2))).clamp(min=1.0)
-    colour = (colour - mean[:, None, None]) * known
     columns = width.mean(-1) * (ALONG - 1) / (ends[..., 1] - ends[..., 0]).clamp(min=1.0)
-    aspect = 0.5 * columns.clamp(0.5, 200.0).log2().reshape(-1, 1, 1) - 1.5
-    constant = [2 * across.abs()[:, None].expand(len(mean), -1, ALONG), aspect.expand(-1, ACROSS, ALONG)]
-    return torch.stack([*colour, known, *constant], 1), ends
+    return channels(read[:3].movedim(0, 1), known, columns.flatten()), ends
+
+
+def channels(
+    colour: Float[Tensor, "m 3 across along"], known: Float[Tensor, "m across along"], columns: Float[Tensor, " m"]
+) -> Float[Tensor, "m 6 across along"]:
+    """The channels of straight pictures of given colours, in [0, 1]; the strips' widths are so many columns long."""
+    bright = (colour + _FLOOR).log()
+    seen = known[:, None]
+    mean = (bright * seen).flatten(1).sum(1) / (3 * known.sum((1, 2))).clamp(min=1.0)
+    bright = (bright - mean[:, None, None, None]) * seen
+    across = 2 * torch.linspace(MARGIN, -MARGIN, ACROSS, device=colour.device).abs()[None, None, :, None]
+    aspect = (0.5 * columns.clamp(0.5, 200.0).log2() - 1.5)[:, None, None, None]
+    shape = (len(colour), 1, ACROSS, ALONG)
+    return torch.cat([bright, seen, across.expand(shape), aspect.expand(shape)], 1)

@@ -4,9 +4,11 @@ does it end. The detector asks it for the end, where it recognises a shaft.
 It was trained on rendered pictures only (tests/benchmarks/train_strip_network.py, which also writes the weights).
 """
 
+import json
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,6 +21,7 @@ KINDS = 2
 """Of ends in view: the tube's end, and a ring that closes it."""
 _FEATURES, _DILATIONS = 32, (1, 2, 4, 8)
 _WEIGHTS = "strip_network.npz"
+_MADE_BY = "made_by"
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,12 +104,20 @@ class StripNetwork(nn.Module):
 def load_network(device: torch.device) -> StripNetwork:
     """The trained network, its weights in half precision in the package."""
     network = StripNetwork()
-    with (files("rmis_calib.vision.coarse") / _WEIGHTS).open("rb") as file, np.load(file) as weights:
-        network.load_state_dict({name: torch.from_numpy(weights[name].astype(np.float32)) for name in weights.files})
+    with (files("rmis_calib.vision.coarse") / _WEIGHTS).open("rb") as file, np.load(file) as stored:
+        weights = {name: torch.from_numpy(stored[name].astype(np.float32)) for name in stored.files if name != _MADE_BY}
+    network.load_state_dict(weights)
     return network.eval().requires_grad_(False).to(device)
 
 
-def save_weights(network: StripNetwork, path: str) -> None:
-    """Write the weights in half precision."""
+def made_by() -> dict[str, Any]:
+    """What the weights in the package were made by: script, version, seed, settings and their hash."""
+    with (files("rmis_calib.vision.coarse") / _WEIGHTS).open("rb") as file, np.load(file) as stored:
+        return json.loads(str(stored[_MADE_BY]))
+
+
+def save_weights(network: StripNetwork, path: str, made_by: dict[str, Any]) -> None:
+    """Write the weights in half precision, and what they were made by."""
     arrays = {name: w.detach().cpu().numpy().astype(np.float16) for name, w in network.state_dict().items()}
-    np.savez_compressed(path, **arrays)
+    arrays[_MADE_BY] = np.array(json.dumps(made_by, sort_keys=True))
+    np.savez_compressed(path, **arrays)  # pyright: ignore[reportArgumentType]
