@@ -62,6 +62,17 @@ def to_image(p: Array) -> Array:
     return p[..., :2] / z
 
 
+def line_through(points: Array) -> Array:
+    """Where the first and the last of image points (..., k, 2) are along the straight line nearest to all of them, the
+    way a detector of lines measures a bent contour; (..., 2, 2)."""
+    centre = points.mean(-2, keepdims=True)
+    x, y = np.moveaxis(points - centre, -1, 0)
+    angle = 0.5 * np.arctan2(2.0 * (x * y).sum(-1), (x * x - y * y).sum(-1))
+    along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)[..., None, :]
+    at = ((points - centre)[..., [0, -1], :] * along).sum(-1, keepdims=True)
+    return centre + at * along
+
+
 def visible_interval(
     p_axis: Array,
     v_axis: Array,

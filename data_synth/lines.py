@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from data_synth.contours import contact_points, to_image, view_cylinder, visible_interval
+from data_synth.contours import contact_points, line_through, to_image, view_cylinder, visible_interval
 from data_synth.kinematics import Arm, Array, pose_noise, random_rotations, rigid, rigid_inverse, transform_points
 from data_synth.motion import joint_grid
 from data_synth.scene import Poses, Scene, build_scene, half_range, moved_from, poses_at
@@ -14,6 +14,8 @@ from data_synth.settings import LineStudyConfig
 
 SHORTEST_VISIBLE_MM = 10.0
 """A shaft of which less is in the picture is not measured."""
+BENT_LENGTH_MM, STATIONS = 60.0, 32
+"""Length before its end over which a bent shaft sags, and places along it that a straight line is laid through."""
 
 
 def simulate_lines(
@@ -87,7 +89,7 @@ def _sigmas(config: LineStudyConfig) -> dict[str, float]:
     for source in ("kinematics", "camera", "stereo"):
         sigmas[f"sigma_{source}_mm"] = getattr(config, f"{source}_noise_mm")
         sigmas[f"sigma_{source}_rad"] = float(np.deg2rad(getattr(config, f"{source}_noise_deg")))
-    sigmas |= {"sigma_setup_mm": 0.0, "sigma_setup_rad": 0.0}
+    sigmas |= {"sigma_setup_mm": 0.0, "sigma_setup_rad": 0.0, "sigma_rcm_mm": 0.0}
     return sigmas
 
 
@@ -140,16 +142,42 @@ def _measure(
     low, high = visible_interval(p_axis, v_axis, 0.0, s_end, bounds)
     valid = high - low > SHORTEST_VISIBLE_MM
     low, high = np.where(valid, low, np.nan), np.where(valid, high, np.nan)
-    axis_points = p_axis[..., None, :] + np.stack([low, high], axis=-1)[..., None] * v_axis[..., None, :]
-    view = view_cylinder(p_axis, v_axis, scene.shaft_radius_mm)
-    contour = np.stack([contact_points(axis_points[..., i, :], view, scene.shaft_radius_mm) for i in range(2)], axis=-2)
+    axis_points, directions = _shaft_between(config, camera_T_rcm, poses, (low, high, s_end))
+    view = view_cylinder(axis_points, directions, scene.shaft_radius_mm)
+    contour = contact_points(axis_points, view, scene.shaft_radius_mm).swapaxes(-2, -3)  # (..., edge, station, 3)
     end = np.where((valid & (high == s_end))[..., None], p_axis + s_end[..., None] * v_axis, np.nan)
     head = transform_points(camera_T_rcm, np.broadcast_to(poses.rcm_p_head, p_axis.shape))
     sigma = config.pixel_noise_px / config.focal_px
 
-    def noisy(points: Array) -> Array:
-        image = to_image(points)
-        return image + sigma * generator.standard_normal(image.shape)
+    measured = {"axis": to_image(axis_points), "contour": to_image(contour)}
+    if config.shaft_sag_mm:
+        measured = {name: line_through(image) for name, image in measured.items()}
+    measured |= {"end": to_image(end), "head": to_image(head)}
+    noisy = {name: image + sigma * generator.standard_normal(image.shape) for name, image in measured.items()}
+    return {f"{name}_{side}": value for name, value in noisy.items()} | {f"valid_{side}": valid}
 
-    measured = {"axis": noisy(axis_points), "contour": noisy(contour), "end": noisy(end), "head": noisy(head)}
-    return {f"{name}_{side}": value for name, value in measured.items()} | {f"valid_{side}": valid}
+
+def _shaft_between(
+    config: LineStudyConfig, camera_T_rcm: Array, poses: Poses, interval: tuple[Array, Array, Array]
+) -> tuple[Array, Array]:
+    """Points of the shaft's axis from one coordinate to another, (..., k, 3), and its direction at each: both ends of a
+    straight shaft, STATIONS of a bent one.
+
+    Args:
+        interval: first and last coordinate, and that of the shaft's end, mm from the RCM.
+    """
+    low, high, s_end = interval
+    R, p = camera_T_rcm[..., :3, :3], camera_T_rcm[..., None, :3, 3]
+    rcm_v = np.broadcast_to(poses.rcm_v_axis, (*camera_T_rcm.shape[:-2], 3))
+    v = np.einsum("...ij,...j->...i", R, rcm_v)[..., None, :]
+    if not config.shaft_sag_mm:
+        s = np.stack([low, high], axis=-1)[..., None]
+        return p + s * v, np.broadcast_to(v, (*s.shape[:-1], 3))
+    s = low[..., None, None] + np.linspace(0.0, 1.0, STATIONS)[:, None] * (high - low)[..., None, None]
+    side = np.array([1.0, 0.0, 0.0]) - rcm_v[..., :1] * rcm_v
+    side = np.einsum("...ij,...j->...i", R, side / np.linalg.norm(side, axis=-1, keepdims=True))[..., None, :]
+    before_end = (s_end[..., None, None] - s) / BENT_LENGTH_MM
+    off = 4.0 * config.shaft_sag_mm * before_end * (1.0 - before_end)
+    slope = 4.0 * config.shaft_sag_mm * (2.0 * before_end - 1.0) / BENT_LENGTH_MM
+    direction = v + slope * side
+    return p + s * v + off * side, direction / np.linalg.norm(direction, axis=-1, keepdims=True)

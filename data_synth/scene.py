@@ -50,7 +50,8 @@ class Scene:
     def robot_dict(self, name: str, *, laparoscope: bool = True) -> dict:
         """The content of robot.yaml."""
         arms = {"laparoscope": arm_to_dict(self.laparoscope, instrument=False)} if laparoscope else {}
-        exact = {"setup_sigma_mm": 0.0, "setup_sigma_deg": 0.0} if laparoscope else {}
+        exact = {"rcm_sigma_mm": 0.0}
+        exact |= {"setup_sigma_mm": 0.0, "setup_sigma_deg": 0.0} if laparoscope else {}
         return {
             "name": name,
             "dh_convention": self.instrument.convention,

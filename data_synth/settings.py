@@ -89,6 +89,9 @@ class LineStudyConfig:
     """Noise of the given camera_left_T_camera_right, once a trial."""
     stereo_noise_deg: NonNegative = 0.0
     """Rotational part of the same."""
+    shaft_sag_mm: NonNegative = 0.0
+    """Bend of the shaft, in a plane fixed to it: an arc over the 60 mm before its end (as much as these scenes show),
+    this far from the straight line between both ends of it in the middle."""
     random_hand_eye: bool = False
     """Draw another camera_right_T_arm for every trial (rotation uniform on SO(3)); the camera's view stays the same."""
 

@@ -93,6 +93,9 @@ class Robot:
     than zero: a calibration estimates that pose too, near to what `base_T_arm_base` says. None: nobody states it."""
     setup_sigma_rad: float | None = None
     """The same of its orientation; both or neither."""
+    rcm_sigma_mm: float | None = None
+    """How far the shaft's axis may pass from the RCM, 1 sigma per axis across it. Zero: through it. None: nobody states
+    it."""
 
     def without_bases(self) -> "Robot":
         """The same arms, with nothing said of where their bases are."""

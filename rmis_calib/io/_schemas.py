@@ -216,6 +216,7 @@ class RobotSchema(Schema):
     arms: Annotated[dict[Name, ArmSchema], Field(min_length=1)]
     setup_sigma_mm: Annotated[float, Field(ge=0)] | None = None
     setup_sigma_deg: Annotated[float, Field(ge=0, le=180)] | None = None
+    rcm_sigma_mm: Annotated[float, Field(ge=0, le=50)] | None = None
 
     @model_validator(mode="after")
     def _prior_of_stated_bases(self) -> "RobotSchema":

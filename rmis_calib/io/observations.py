@@ -110,6 +110,9 @@ class ShaftObservations:
     sigma_setup_mm: float | None = None
     """Of the stated set-up, per axis, right perturbation; None: as the settings of the solver say."""
     sigma_setup_rad: float | None = None
+    sigma_rcm_mm: float | None = None
+    """Of the distance at which the shaft's axis passes the RCM, per axis across it; None: as the settings of the solver
+    say."""
     sigma_axis_right: np.ndarray | None = None
     """(N,): one sigma of both points across the line, normalised units; NaN: `sigma_image`. The others likewise."""
     sigma_axis_left: np.ndarray | None = None

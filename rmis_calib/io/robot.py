@@ -30,7 +30,7 @@ def load_robot(name_or_path: str | Path, note: Note = no_note) -> Robot:
     schema = validate(RobotSchema, load_yaml(path, RobotError), str(path), RobotError)
     arms = {name: _arm(arm, f"{path}: arms.{name}", note) for name, arm in schema.arms.items()}
     sigma_rad = None if schema.setup_sigma_deg is None else math.radians(schema.setup_sigma_deg)
-    return Robot(schema.name, schema.dh_convention, arms, schema.setup_sigma_mm, sigma_rad)
+    return Robot(schema.name, schema.dh_convention, arms, schema.setup_sigma_mm, sigma_rad, schema.rcm_sigma_mm)
 
 
 def robot_to_dict(robot: Robot) -> dict:
@@ -40,6 +40,8 @@ def robot_to_dict(robot: Robot) -> dict:
         # Digits beyond a micro-degree are the rounding of the conversion.
         degrees = round(math.degrees(robot.setup_sigma_rad), 6)
         prior = {"setup_sigma_mm": robot.setup_sigma_mm, "setup_sigma_deg": degrees}
+    if robot.rcm_sigma_mm is not None:
+        prior["rcm_sigma_mm"] = robot.rcm_sigma_mm
     return {
         "name": robot.name,
         "dh_convention": robot.dh_convention,

@@ -42,6 +42,7 @@ class NoiseLevels:
         lens: of its radial distortion k1.
         setup_mm: per axis, of the stated `laparoscope_base_T_instrument_base` (right perturbation).
         setup_rad: its orientation.
+        rcm_mm: per axis across the shaft, of the distance at which its axis passes the RCM.
     """
 
     image: Float[Tensor, "*batch"]
@@ -57,6 +58,7 @@ class NoiseLevels:
     lens: Float[Tensor, "*batch"]
     setup_mm: Float[Tensor, "*batch"]
     setup_rad: Float[Tensor, "*batch"]
+    rcm_mm: Float[Tensor, "*batch"]
 
 
 _NONE_UNLESS_NAMED = ("camera_mm", "camera_rad", "edge_bias", "focal", "centre", "lens")

@@ -46,9 +46,10 @@ class UnknownSettings:
     """Estimate one constant offset of the shaft's end along the axis, where ends are measured."""
     end_offset_sigma_mm: NotNegative = 30.0
     """Prior of that offset."""
-    rcm_offset: bool = False
-    """Estimate by how much the shaft's axis misses the nominal RCM, two components across the axis, fixed to `rcm`."""
-    rcm_offset_sigma_mm: NotNegative = 2.0
+    rcm_offset: Literal["never", "auto", "always"] = "auto"
+    """Estimate by how much the shaft's axis misses the nominal RCM, two components across the axis, fixed to `rcm`
+    (that of the laparoscope is part of the transform); `auto`: where the data ask for it."""
+    rcm_offset_sigma_mm: NotNegative = 1.0
     """Prior of each component."""
     joint_offsets: Literal["auto", "always", "never"] = "auto"
     """Estimate constant joint offsets, where the derivatives of the kinematics are in the problem. `calibrate` does so
@@ -94,10 +95,10 @@ class UnknownSettings:
     enters the covariance as far as the data cannot tell: in full where the laparoscope stands still."""
     setup_doubt_deg: NotNegative = 0.5
     """The same of its orientation."""
-    doubt: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.5
+    doubt: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.2
     """Probability, before the data speak, that a believed set-up is off by about its doubt, and that the instrument's
     arm gives way by about its prior. It decides how much the covariance allows for that, not the estimate; 0 trusts
-    both."""
+    both, the RCM and the principal points."""
     compliance: Literal["never", "auto", "always"] = "auto"
     """Estimate by how much the instrument's arm gives way: a bend and a shift of the shaft that change smoothly with
     its pose (a flexing cannula, a remote centre that moves, joints that wind up). `auto`: where the

@@ -94,3 +94,43 @@ def test_static_laparoscope_has_one_arm_pose() -> None:
     out = simulate_lines(LineStudyConfig(trials=1, positions_laparoscope=1, positions_instrument=3))
     assert out["arm_T_rcm"].shape == (1, 27, 4, 4)
     assert np.ptp(out["arm_T_rcm"], axis=1).max() == 0.0
+
+
+def test_a_bent_shaft_is_measured_as_the_lines_through_its_outline() -> None:
+    """Outline by brute force: rings of the tube about the bent axis, and of each the points farthest to either side in
+    the picture."""
+    c = dict(trials=1, pixel_noise_px=0.0, motion="random", random_motions=6, seed=3)
+    bent, straight = simulate_lines(LineStudyConfig(shaft_sag_mm=1.0, **c)), simulate_lines(LineStudyConfig(**c))
+    T = bent["truth"]["camera_right_T_rcm"][0]
+    np.testing.assert_array_equal(bent["arm_T_rcm"], straight["arm_T_rcm"])
+    for i in range(6):
+        R, p, rcm_v = T[i, :3, :3], T[i, :3, 3], bent["rcm_v_axis"][0, i]
+        v, end_mm = R @ rcm_v, bent["rcm_s_end_mm"][0, i] + bent["truth"]["shaft_end_offset_mm"]
+        side = R @ (np.eye(3)[0] - rcm_v[0] * rcm_v)
+        side /= np.linalg.norm(side)
+        s = np.linspace(end_mm - 90.0, end_mm, 9001)
+        axis = p + s[:, None] * v
+        s = s[(np.abs(axis[:, :2] / axis[:, 2:]) <= [0.8, 0.6]).all(-1)]
+        s = np.linspace(s[0], s[-1], 32)
+        u = (end_mm - s) / 60.0
+        curve = p + s[:, None] * v + (4.0 * u * (1.0 - u))[:, None] * side
+        tangent = np.gradient(curve, s, axis=0, edge_order=2)
+        tangent /= np.linalg.norm(tangent, axis=-1, keepdims=True)
+        first = np.cross(tangent, [0.0, 0.0, 1.0])
+        first /= np.linalg.norm(first, axis=-1, keepdims=True)
+        second = np.cross(tangent, first)
+        angle = np.linspace(0.0, 2.0 * np.pi, 721)[:, None, None]
+        ring = curve + 4.0 * (np.cos(angle) * first + np.sin(angle) * second)  # (angle, station, 3)
+        uv = ring[..., :2] / ring[..., 2:]
+        along = straight["axis_right"][0, i, 1] - straight["axis_right"][0, i, 0]
+        along /= np.linalg.norm(along)
+        left = np.array([along[1], -along[0]])
+        for edge, sign in ((0, 1.0), (1, -1.0)):
+            index = (sign * (uv @ left)).argmax(0)
+            x, y = (uv[index, np.arange(len(curve))] @ axis for axis in (along, left))
+            slope, height = np.polyfit(x, y, 1)
+            measured = bent["contour_right"][0, i, edge]
+            off_px = 800.0 * (measured @ left - slope * (measured @ along) - height)
+            moved_px = 800.0 * ((measured - straight["contour_right"][0, i, edge]) @ left)
+            assert np.abs(off_px).max() < 0.03
+            assert np.abs(moved_px).max() > 1.0

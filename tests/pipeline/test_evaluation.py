@@ -30,7 +30,7 @@ CASES = {
     "clean": ({}, {}),
     "clock off": (SMOOTH, {}),
     "joint offsets": ({"noise": {"joint_offset_deg": 0.5, "joint_offset_mm": 0.5}}, {"joint_offsets": "always"}),
-    "RCM offset": ({}, {"rcm_offset": True}),
+    "RCM offset": ({}, {"rcm_offset": "always"}),
     "still": ({"motion": {"laparoscope": "static"}}, {}),
 }
 

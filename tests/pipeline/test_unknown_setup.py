@@ -131,6 +131,7 @@ def test_a_roughly_known_set_up_is_a_prior(recorded, tmp_path):
     rough.write_text(yaml.safe_dump(robot_to_dict(drawn_robot(stated))))
     robot = load_robot(rough)
     assert robot.setup_sigma_mm == 50.0 and robot.setup_sigma_rad == pytest.approx(0.0873, abs=1e-8)
+    assert robot.rcm_sigma_mm == 0.0
     recording = replace(stated, robot=robot)
     result = rc.solve(observed(path, recording, motion_poses(recording)), CONFIG, throw=False)
     truth = np.array(yaml.safe_load((path / "ground_truth.yaml").read_text())["camera_right_T_arm"])
@@ -159,6 +160,7 @@ def test_a_still_laparoscope_with_a_roughly_known_set_up_leaves_the_instruments_
     ("change", "message"),
     [
         ({"setup_sigma_mm": 50.0}, "found only setup_sigma_mm"),
+        ({"rcm_sigma_mm": -1.0}, "rcm_sigma_mm"),
         ({"setup_sigma_mm": 0.0, "setup_sigma_deg": 5.0}, "setup_sigma_mm"),
         (
             {"setup_sigma_mm": 50.0, "setup_sigma_deg": 5.0, "bases": False},

@@ -70,7 +70,7 @@ def test_offsets_of_joints_and_clock_move_it_as_they_move_the_shaft(arrays):
         clock_derivative=torch.randn(2, n, 6, 2, generator=generator, dtype=torch.float64) * scale[:, None],
         joint_offset_sigma=torch.full((2, 2), 0.05, dtype=torch.float64),
     )
-    settings = replace(FIXED, unknowns=UnknownSettings(joint_offsets="always", rcm_offset=True))
+    settings = replace(FIXED, unknowns=UnknownSettings(joint_offsets="always", rcm_offset="always"))
     expected = solve(problem.only("contours", "heads"), settings)
     found = solve(problem.only("contours").with_own(both_heads(arrays)), settings)
     for name in ("joint_offset", "clock", "rcm_offset"):

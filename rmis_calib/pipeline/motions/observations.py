@@ -53,6 +53,7 @@ def assemble(
         sigma_focal=errors.focal_sigma_relative,
         sigma_centre=errors.centre_sigma_px / focal,
         sigma_lens=errors.lens_sigma,
+        sigma_rcm_mm=recording.robot.rcm_sigma_mm,
         **head_observations(recording, poses),
         **arrays,
     )

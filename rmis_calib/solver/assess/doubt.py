@@ -5,6 +5,7 @@ import math
 
 import torch
 from jaxtyping import Float
+from scipy.special import gammaincinv
 from torch import Tensor
 
 from rmis_calib.solver.assess.left_out import Freed, eliminated, reported
@@ -21,10 +22,27 @@ CENTRE_DOUBT = 0.8
 of each) and a still laparoscope are within the 95 % ellipsoid, with this 92 %."""
 
 
+RCM_DOUBT = 0.5
+"""Probability, before the data speak, that the shaft misses the RCM by about its prior: more than for a set-up that
+somebody measured. With 0.2, 5 % of trials with a still laparoscope and an RCM missed by 1 mm are called trustworthy and
+wrong, with this none."""
+COVERED = 0.95
+"""Part of all cases that the ellipsoid of this size is to hold, whether an unknown is nominal or not."""
+
+
+def belief_in(name: str, asked: UnknownSettings) -> float:
+    """Probability, before the data speak, that an unknown is off by about how far it may be; 0: everything is
+    trusted."""
+    return max(asked.doubt, RCM_DOUBT) if name == "rcm_offset" and asked.doubt else asked.doubt
+
+
 def considered(
     nominal: NuisancePriors, asked: UnknownSettings, name: str, sigma: Float[Tensor, "b q"]
 ) -> Float[Tensor, "b q"]:
-    """How far the unknown may be off: of a set-up, what the data state, else what is assumed; zero: it is exact."""
+    """How far the unknown may be off: of a set-up and of the RCM, what the data state, else what is assumed; zero: it
+    is exact."""
+    if name == "rcm_offset":
+        return torch.nan_to_num(nominal.rcm_mm, nan=asked.rcm_offset_sigma_mm)[:, None].expand_as(sigma)
     if name != "setup":
         return sigma
     rad = torch.nan_to_num(nominal.setup_rad, nan=math.radians(asked.setup_doubt_deg))
@@ -62,7 +80,22 @@ def doubt_of(
     effect = block.effect * unit[:, None] @ vectors
     off = (effect @ (spread * along)[..., None])[..., 0]
     covariance = effect * spread[..., None, :] @ effect.mT + off[..., :, None] * off[..., None, :]
-    return (probability[..., None, None] * covariance).sum(0)
+    of_any = probability.sum(0)
+    share = probability / of_any.clamp_min(1e-300) * part_that_covers(of_any)
+    return (share[..., None, None] * covariance).sum(0)
+
+
+def part_that_covers(probability: Float[Tensor, " b"]) -> Float[Tensor, " b"]:
+    """Part of what an unknown does to the covariance, if it is off with this probability, that must be allowed for.
+
+    The second moment of both cases together, which is the probability itself, is too small an ellipsoid for the case of
+    the unknown being off. With 1 - COVERED of all cases outside, all of which may be of that case, COVERED of all are
+    within the ellipsoid where 1 - (1 - COVERED) / probability of that case are: a quantile of chi^2, over that of
+    COVERED.
+    """
+    within = (1.0 - (1.0 - COVERED) / probability.clamp_min(1e-12)).clamp_min(0.0).cpu().numpy()
+    part = gammaincinv(3.0, within) / gammaincinv(3.0, COVERED)
+    return torch.as_tensor(part).to(probability).maximum(probability)
 
 
 def doubt_of_centres(fit: MapEstimate) -> Float[Tensor, "b m m"]:

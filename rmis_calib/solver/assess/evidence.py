@@ -22,7 +22,7 @@ from jaxtyping import Float
 from scipy.special import fdtrc
 from torch import Tensor
 
-from rmis_calib.solver.assess.doubt import considered, doubt_of, doubt_of_centres
+from rmis_calib.solver.assess.doubt import belief_in, considered, doubt_of, doubt_of_centres
 from rmis_calib.solver.assess.groups import RIDGE, groups_of, leave_groups_out, sums_of
 from rmis_calib.solver.assess.left_out import Candidates, Freed
 from rmis_calib.solver.estimate.bias import expected_score
@@ -31,7 +31,7 @@ from rmis_calib.solver.model.normal_equations import WeightedModel, membership
 from rmis_calib.solver.model.state import State
 from rmis_calib.solver.settings import SolverSettings
 
-CHANCE = {"clock_rate": 0.005, "setup": 0.02, "compliance": 1e-4}
+CHANCE = {"clock_rate": 0.005, "setup": 0.02, "rcm_offset": 0.02, "compliance": 1e-4}
 """Probability, with everything nominal, from which an unknown is freed: less for what costs more."""
 SEEN = 2.0
 """Information on a direction, in that of the prior, from which it counts."""
@@ -53,14 +53,15 @@ class Evidence:
 
 def weigh(fit: MapEstimate, settings: SolverSettings) -> Evidence:
     """Evidence on the unknowns that are left out and may be estimated (`clock_rate`; `setup`, where the laparoscope's
-    own kinematics are told; `compliance`), doubt of the latter two, and of the cameras' principal points, which may all
-    be off alike (`centre`)."""
+    own kinematics are told; `rcm_offset`; `compliance`), doubt of the latter three, and of the cameras' principal
+    points, which may all be off alike (`centre`)."""
     asked, chance, doubt = settings.unknowns, {}, {}
     if "intrinsics" in fit.model.layout.blocks and asked.doubt > 0.0:
         doubt["centre"] = doubt_of_centres(fit)
     left_out = {
         "clock_rate": asked.clock_rate == "auto" and "clock" in fit.model.layout.blocks,
         "setup": asked.setup == "known" and fit.problem.laparoscope_base_T_arm is not None,
+        "rcm_offset": asked.rcm_offset == "auto",
         "compliance": asked.compliance == "auto",
     }
     names = [name for name, is_left_out in left_out.items() if is_left_out]
@@ -79,7 +80,7 @@ def weigh(fit: MapEstimate, settings: SolverSettings) -> Evidence:
             block = replace(block, A=block.A * seen[:, None, None], u=block.u * seen[:, None])
         sigma = candidates.sigma(name)
         size = considered(candidates.nominal, asked, name, sigma)
-        doubt[name] = doubt_of(block, sigma, size, inflation, asked.doubt)
+        doubt[name] = doubt_of(block, sigma, size, inflation, belief_in(name, asked))
     return Evidence(chance, doubt)
 
 

@@ -129,6 +129,7 @@ class NuisancePriors:
         setup_at: where the kinematics were evaluated, from the stated set-up (from none: the identity); as
             `State.setup`.
         setup_mm, setup_rad: given sigmas of the stated set-up; NaN where unknown, 0 where it is exact.
+        rcm_mm: given sigma of the shaft's offset from the RCM, likewise.
     """
 
     stereo: Float[Tensor, "b 4 4"]
@@ -143,6 +144,7 @@ class NuisancePriors:
     setup_at: Float[Tensor, "b 6"]
     setup_mm: Float[Tensor, " b"]
     setup_rad: Float[Tensor, " b"]
+    rcm_mm: Float[Tensor, " b"]
 
     @classmethod
     def of(cls, problem: Problem) -> "NuisancePriors":
@@ -164,6 +166,7 @@ class NuisancePriors:
             setup_at=_setup_at(problem),
             setup_mm=level.setup_mm,
             setup_rad=level.setup_rad,
+            rcm_mm=level.rcm_mm,
         )
 
     def repeat(self, part: slice, times: int) -> "NuisancePriors":
@@ -220,8 +223,10 @@ def make_layout(
         entries.append(("radius", 1, settings.radius_sigma_relative * origin.radius))
     if settings.end_offset and measured.has_ends:
         entries.append(("end_offset", 1, torch.full_like(infinite, settings.end_offset_sigma_mm)))
-    if settings.rcm_offset:
-        entries.append(("rcm_offset", 2, torch.full_like(infinite, settings.rcm_offset_sigma_mm)))
+    if settings.rcm_offset == "always":
+        # One that is stated to be none, and yet to be estimated, is one.
+        rcm_mm = torch.where(nominal.rcm_mm > 0, nominal.rcm_mm, settings.rcm_offset_sigma_mm)
+        entries.append(("rcm_offset", 2, rcm_mm))
     if settings.joint_offsets != "never" and measured.joint is not None and nominal.joint_offset_sigma.shape[1] > 0:
         entries.append(("joint_offset", measured.joint.shape[1], nominal.joint_offset_sigma))
     if settings.clock and measured.clock is not None:

@@ -20,7 +20,7 @@ def test_rcm_offset_needs_nothing_but_the_observations(simulate, realistic):
     moved = replace(problem, arm_T_rcm=T, laparoscope_base_T_arm=None).only("contours", "ends")
     X = torch.as_tensor(truth["camera_right_T_arm"])[:, :3, 3]
     alone = {"radius_sigma_relative": 0.0, "compliance": "never"}
-    found = solve(moved, SolverSettings(unknowns=UnknownSettings(rcm_offset=True, **alone)))
+    found = solve(moved, SolverSettings(unknowns=UnknownSettings(rcm_offset="always", **alone)))
     ignored = solve(moved, SolverSettings(unknowns=UnknownSettings(**alone)))
     offset = found.nuisances["rcm_offset"]
     assert bool(((offset.value - offset.value.new_tensor([1.5, -1.0])).abs() < 4.0 * offset.sigma).all())

@@ -16,7 +16,7 @@ from rmis_calib.solver.model.residuals import linearise, residual_rows
 from rmis_calib.solver.settings import UnknownSettings
 
 EVERYTHING = UnknownSettings(
-    rcm_offset=True, joint_offsets="always", clock=True, clock_rate="always", setup="prior", compliance="always"
+    rcm_offset="always", joint_offsets="always", clock=True, clock_rate="always", setup="prior", compliance="always"
 )
 
 
