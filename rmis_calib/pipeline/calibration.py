@@ -12,7 +12,7 @@ from rmis_calib.geometry.rigid import RigidTransform
 from rmis_calib.io import Recording, ShaftObservations
 from rmis_calib.pipeline.answer.advice import with_next_motions
 from rmis_calib.pipeline.answer.estimation import estimate, raise_unless_trustworthy
-from rmis_calib.pipeline.answer.guided_look import look_along
+from rmis_calib.pipeline.answer.guided_look import about_looks, look_along
 from rmis_calib.pipeline.answer.motion_names import MotionNames
 from rmis_calib.pipeline.answer.offsets import estimate_with_kinematics
 from rmis_calib.pipeline.answer.result import insufficient_data, make_result, motions_of, residual_of, residuals_px
@@ -27,6 +27,7 @@ from rmis_calib.pipeline.checks.misfit import with_misfit_named
 from rmis_calib.pipeline.device import require_device
 from rmis_calib.pipeline.evaluation import head_point_errors, summarise_head_points
 from rmis_calib.pipeline.motions.association import Choice, associate, association_gate, consistent_choice, read_prior
+from rmis_calib.pipeline.motions.consensus import with_consensus
 from rmis_calib.pipeline.motions.observations import assemble
 from rmis_calib.pipeline.pictures.background import about_background, without_background
 from rmis_calib.pipeline.pictures.detection import Progress, View, detect_recording, no_progress
@@ -35,6 +36,8 @@ from rmis_calib.results import CalibrationResult
 from rmis_calib.solver.problem import stands_still
 from rmis_calib.vision.masks import Segmenter
 
+LOOKS = 2
+"""Looks at the pictures along the prediction at most."""
 CHOICE_ROUNDS = 3
 """Solves at most: a choice of candidates that has not settled by then alternates between equals."""
 
@@ -108,17 +111,19 @@ def calibrate_views(
         with_pictures: the views' pictures can be read, to look at them again along what a first answer predicts.
     """
     attempts, several = associate(recording, config, poses, views, prior)
+    if prior is None and config.instrument_at is None:
+        attempts = with_consensus(recording, poses, views, attempts)
     checked = (*about_motions(recording, poses, config), *about_order(recording, poses, views, attempts[0]))
     notes += tuple(f"{finding.topic}: {finding.sentence}" for finding in checked if finding.is_doubt)
     draft = _without_joint_offsets(config)
     run = solve_choices(recording, draft, views, poses, attempts, progress)
+    run, looks = _look_again(run, draft, several, progress) if with_pictures else (run, ())
     run = _choose_again(run, draft, several, progress)
-    run, about_looks = _look_again(run, draft, several, progress) if with_pictures else (run, ())
     run, about_rows = _with_rows_at_one_instant(run, draft, progress)
     run = _with_joint_offsets(run, config, progress)
     progress("checking", 0, 1)
     run = with_misfit_named(run, config, lambda: _with_cameras_as_given(run, config))
-    run = run.with_notes((*recording.notes, *notes, *about_looks, *about_rows))
+    run = run.with_notes((*recording.notes, *notes, *looks, *about_rows))
     run = with_next_motions(run, config)
     progress("checking", 1, 1)
     return run
@@ -194,18 +199,21 @@ def _choose_again(run: CalibrationRun, config: CalibrationConfig, several: bool,
 def _look_again(
     run: CalibrationRun, config: CalibrationConfig, several: bool, progress: Progress
 ) -> tuple[CalibrationRun, tuple[str, ...]]:
-    """The run with what a look at the pictures along its prediction finds, and notes on it."""
-    if run.result.status not in ("ok", "weak"):
-        return run, ()
-    views, notes = look_along(run, config, progress)
-    if not notes:
-        return run, ()
-    looked = replace(run, views=views)
-    choices = better_choices(looked, several)
-    if choices is None:
-        return run, ()
-    again = _choose_again(_solve_again(looked, config, choices, progress), config, several, progress)
-    return (again, notes) if again.result.status in ("ok", "weak") else (run, ())
+    """The run with what looks at the pictures along its prediction find, and notes on it.
+
+    What a first look finds makes the prediction better, and another one finds more.
+    """
+    before = run
+    for _ in range(LOOKS):
+        views = look_along(run, config, progress) if run.result.status in ("ok", "weak") else None
+        choices = None if views is None else better_choices(replace(run, views=views), several)
+        if views is None or choices is None:
+            break
+        again = _solve_again(replace(run, views=views), config, choices, progress)
+        if again.result.status not in ("ok", "weak"):
+            break
+        run = again
+    return run, about_looks(before.views, run.views)
 
 
 def better_choices(run: CalibrationRun, several: bool) -> tuple[Choice, ...] | None:

@@ -12,7 +12,7 @@ import rmis_calib as rc
 from rmis_calib.config import parse_config
 from rmis_calib.errors import InputError
 from rmis_calib.geometry.lines import contour_planes
-from rmis_calib.pipeline.answer.guided_look import look_along
+from rmis_calib.pipeline.answer.guided_look import about_looks, look_along
 from rmis_calib.pipeline.arms.poses import motion_poses
 from rmis_calib.pipeline.calibration import better_choices, run_calibration
 from rmis_calib.pipeline.motions.association import (
@@ -214,12 +214,14 @@ def check_a_look_along_the_prediction(run, config):
         valid[::2] = False
         blank.append(replace(view, detections=replace(view.detections, valid=valid)))
     run = replace(run, views=tuple(blank))
-    views, notes = look_along(run, config, no_progress)
+    views = look_along(run, config, no_progress)
+    assert views is not None
+    notes = about_looks(run.views, views)
     wrong = run.result.camera_right_T_arm.matrix.clone()
     wrong[:3, 3] += torch.tensor([10.0, 0.0, 0.0])
     wrong = replace(run.result.camera_right_T_arm, matrix=wrong)
-    astray, _ = look_along(replace(run, result=replace(run.result, camera_right_T_arm=wrong)), config, no_progress)
-    for view, before, off in zip(views, blank, astray, strict=True):
+    astray = look_along(replace(run, result=replace(run.result, camera_right_T_arm=wrong)), config, no_progress)
+    for view, before, off in zip(views, blank, astray or blank, strict=True):
         shown = view.detections.valid[::2]
         assert float(shown.any(-1).double().mean()) > 0.8
         assert torch.equal(view.detections.valid[1::2], before.detections.valid[1::2])

@@ -20,28 +20,35 @@ _NEAR = 0.01
 _SAMPLES, _STEP_MM = 24, 4.0
 
 
-def look_along(
-    run: CalibrationRun, config: CalibrationConfig, progress: Progress
-) -> tuple[tuple[View, ...], tuple[str, ...]]:
-    """The views with what is found where the answer puts the shaft, in pictures that show nothing there so far; and a
-    note for each view that gained something.
+def look_along(run: CalibrationRun, config: CalibrationConfig, progress: Progress) -> tuple[View, ...] | None:
+    """The views with what is found where the answer puts the shaft, in pictures that show nothing there so far; None
+    where nothing is.
 
     Nothing is taken away: candidates that lie elsewhere still speak against the answer.
     """
-    views, notes = [], []
+    views, gained = [], 0
     for view in run.views:
         expected = run.predicted_contours(view)
         if expected is None or view.camera is None:
-            return run.views, ()
+            return None
         wanted = _in_view(run, view) & ~_has_near(view.at(run.poses.frames), expected)
-        detections, gained = _with_looks(view, run, expected, wanted, config, progress)
+        detections, found = _with_looks(view, run, expected, wanted, config, progress)
         views.append(replace(view, detections=detections))
-        if gained:
+        gained += found
+    return tuple(views) if gained else None
+
+
+def about_looks(before: tuple[View, ...], after: tuple[View, ...]) -> tuple[str, ...]:
+    """A note for each view that gained something."""
+    notes = []
+    for old, new in zip(before, after, strict=True):
+        gained = int((new.detections.valid.sum(-1) > old.detections.valid.sum(-1)).sum())
+        if new is not old and gained:
             notes.append(
-                f"camera_{view.side}: in {gained} of {int(wanted.sum())} pictures that showed no shaft where the first "
-                "answer puts it, one was found by looking there again"
+                f"camera_{new.side}: in {gained} pictures a shaft was found by looking again where the first answer "
+                "puts it"
             )
-    return tuple(views), tuple(notes)
+    return tuple(notes)
 
 
 def _has_near(found: ShaftDetections, expected: Float[Tensor, "m 2 3"]) -> Bool[Tensor, " m"]:
