@@ -13,7 +13,8 @@ from data_synth.truth import side_truth
 from data_synth.world import build_world
 from rmis_calib.errors import ShapeError
 from rmis_calib.geometry import Camera
-from rmis_calib.vision import FrameReason, ShaftDetector
+from rmis_calib.vision import EndKind, FrameReason, ShaftDetector
+from rmis_calib.vision.fine.expected import where_expected
 
 # A tube of tissue lies over the middle of the shaft, which is of bright metal to the eye.
 FRAMES = np.array([0, 20, 21, 22, 23, 36])
@@ -68,6 +69,18 @@ def test_a_hidden_shaft_is_measured_where_a_good_answer_expects_it(scene):
     searched = detector.detect(images)
     alone = searched.valid[:, 0].numpy() & (errors_px(searched, truth, float(camera.focal)) < 3)
     assert alone.sum() <= 1
+
+
+def test_only_an_end_of_a_known_kind_counts(scene):
+    images, truth, camera = scene
+    found = ShaftDetector(camera=camera).look_along(images, expected(truth))
+    some = replace(found, end_valid=found.valid.clone(), end_kind=torch.full_like(found.end_kind, EndKind.UNKNOWN))
+    some.end_kind[::2] = int(EndKind.RING)
+    width = torch.full((len(FRAMES), 1), 0.1)
+    again = where_expected(some, expected(truth), width, torch.zeros(len(FRAMES), dtype=torch.bool), 0.4)
+    assert torch.equal(again.valid, found.valid)
+    assert torch.equal(again.end_valid[::2], found.valid[::2])
+    assert not again.end_valid[1::2].any()
 
 
 @pytest.mark.parametrize("turn_deg", [5.0, -5.0])
