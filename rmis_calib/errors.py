@@ -28,6 +28,10 @@ class InputError(_ExpectedFound, ValueError):
     """The caller's mistake: a value, shape, unit or file content that cannot be right."""
 
 
+class DeviceError(InputError):
+    """A device that this machine does not have, or that was lost."""
+
+
 class ShapeError(InputError):
     """A tensor of the wrong shape or dtype."""
 

@@ -1,8 +1,8 @@
+from .plan import plan as plan
 from .pooling import Pooled as Pooled
 from .pooling import pool as pool
-from .run import Progress as Progress
+from .progress import Progress as Progress
 from .run import batch as batch
-from .run import plan as plan
 from .settings import BatchSettings as BatchSettings
 from .setups import SetupComparison as SetupComparison
 from .setups import compare as compare

@@ -25,6 +25,9 @@ class BatchSettings:
     shared by the workers (Linux)."""
     fail_fast: bool = False
     """Stop at the first recording without a trustworthy result; those at work are finished."""
+    device_batch: Annotated[int, Field(ge=0)] | None = None
+    """Most frames that the process of a device searches at once, of all recordings whose camera and picture size are
+    the same; the workers only decode and solve. 0: each worker searches its own. Default: 64 on a GPU, 0 on a CPU."""
     overlays: Annotated[int, Field(ge=-1)] = 12
     """Pictures drawn a recording with detected and predicted contours (-1: every frame)."""
     overlay_video: bool = False

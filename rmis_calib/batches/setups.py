@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from rmis_calib.batches.pooling import (
     own_covariances,
     pool,
 )
+from rmis_calib.batches.task import JobRecord
 from rmis_calib.errors import InputError
 from rmis_calib.results import JOINT_OFFSET, CalibrationResult
 
@@ -133,6 +135,19 @@ def compare(results: Sequence[CalibrationResult], names: Sequence[str], setup: s
     edges = [0, *(change.index for change in found), len(kept)]
     segments = tuple(pool(kept[a:b]) for a, b in pairwise(edges)) if found else (pooled,)
     return SetupComparison(setup, kept_names, kept, pooled, tuple(found), segments, _drifts(kept))
+
+
+def setups_of(out: Path, records: Sequence[JobRecord]) -> tuple[SetupComparison, ...]:
+    """Comparisons of the recordings of each set-up."""
+    by_setup: dict[str, list[JobRecord]] = {}
+    for record in records:
+        if record.outcome == "finished" and "setup" in record.row:
+            by_setup.setdefault(record.row["setup"], []).append(record)
+    comparisons = []
+    for setup, members in sorted(by_setup.items()):
+        results = [CalibrationResult.read(out / PurePosixPath(member.name) / "result.json") for member in members]
+        comparisons.append(compare(results, [member.name for member in members], setup))
+    return tuple(comparisons)
 
 
 def told_diameter_mm(result: CalibrationResult) -> float | None:

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from rmis_calib.batches.jobs import Job
-from rmis_calib.errors import OutputError, RmisCalibError
+from rmis_calib.errors import DeviceError, OutputError, RmisCalibError
 from rmis_calib.io.atomic import atomic_directory, write_json
 from rmis_calib.io.configs import load_json
 from rmis_calib.io.plain_values import finite_or_none
@@ -30,14 +30,17 @@ from rmis_calib.results import Nuisance
 if TYPE_CHECKING:
     from rmis_calib.io import RecordingDescription
     from rmis_calib.pipeline import CalibrationRun
+    from rmis_calib.pipeline.pictures.detection import Detectors
     from rmis_calib.results import CalibrationResult
 
 JOB_FORMAT = "rmis-calib-job/1"
 RECORD, LOG = "job.json", "log.jsonl"
-Failure = Literal["input", "output", "memory", "crash", "bug"]
+Failure = Literal["input", "output", "memory", "crash", "device", "bug"]
 """input: the recording is at fault, and trying again is of no use; the others are the machine's, or the program's."""
 _OUT_OF_MEMORY = ("out of memory", "can't allocate memory", "insufficient memory", "cannot allocate memory")
 _PROFILED = 60
+_REQUESTS = 2
+"""Batches of a worker at its device: one is searched while the next waits."""
 
 Report = Callable[[str, int, int], None]
 
@@ -53,6 +56,7 @@ class Order:
         overlays: pictures a camera; -1: every frame.
         overlay_video: whether to write a video with what was detected and predicted.
         profile: whether to write where the time went.
+        service: address of the process that owns the device; None: the worker looks at its pictures itself.
     """
 
     job: Job
@@ -61,6 +65,7 @@ class Order:
     overlays: int
     overlay_video: bool
     profile: bool
+    service: str | None = None
 
 
 @dataclass(frozen=True)
@@ -195,7 +200,7 @@ def _calibrate(order: Order, folder: Path, log: "StageLog") -> tuple[str, dict[s
     description = read_description(order.job.source)
     recording = load_recording(description)
     log("reading", 1, 1)
-    run = run_calibration(recording, order.job.config, log)
+    run = run_calibration(recording, order.job.config, log, detectors=_detectors(order))
     log("writing", 0, 1)
     drawn = write_calibration_folder(folder, run, order.overlays, order.overlay_video)
     write_thumbnail(folder / "thumbnail.jpg", drawn)
@@ -210,7 +215,7 @@ def _detect(order: Order, folder: Path, log: "StageLog") -> tuple[str, dict[str,
     from rmis_calib.report import DetectionPictures, PictureChoice, write_lines
 
     with DetectionPictures(folder, PictureChoice(order.overlays, order.overlay_video)) as pictures:
-        table = detect(order.job.source, order.job.config, log, pictures.add)
+        table = detect(order.job.source, order.job.config, log, pictures.add, detectors=_detectors(order))
     log("writing", 0, 1)
     write_lines(folder, table)
     log("writing", 1, 1)
@@ -219,6 +224,19 @@ def _detect(order: Order, folder: Path, log: "StageLog") -> tuple[str, dict[str,
         row[f"found_{view.side}"] = int(view.found.sum())
     found = sum(int(view.found.sum()) for view in table.views)
     return f"{found} of {row['frames']} pictures with a shaft", row
+
+
+def _detectors(order: Order) -> "Detectors":
+    """Who looks for shafts: the process that owns the device, or this one; always this one where masks show them."""
+    from rmis_calib.pipeline.pictures.detection import OWN_DETECTORS, Detectors
+
+    config = order.job.config
+    if order.service is None or config.masks is not None:
+        return OWN_DETECTORS
+    from rmis_calib.parallel.shared_detector import SharedDevice
+
+    device = SharedDevice(order.service, config.device)
+    return Detectors(device.detector, pictures_on="cpu", at_once=_REQUESTS)
 
 
 def row_of_run(run: "CalibrationRun", description: "RecordingDescription") -> dict[str, Any]:
@@ -308,6 +326,8 @@ def _classified(error: Exception, source: Path) -> tuple[Failure, str]:
     text = _one_line(error, source)
     if isinstance(error, MemoryError) or any(words in str(error).lower() for words in _OUT_OF_MEMORY):
         return "memory", f"it needs more memory than there is for a worker ({text[:200]})"
+    if isinstance(error, DeviceError):
+        return "device", text
     if isinstance(error, RmisCalibError):
         return "input", text
     return "bug", f"{type(error).__name__}: {text} (a bug; {LOG} has the traceback)"

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from rmis_calib.batches import BatchSummary, Progress, SetupComparison
-    from rmis_calib.batches.run import Plan
+    from rmis_calib.batches.plan import Plan
     from rmis_calib.results import CalibrationResult
 
 _NAME_WIDTH = 34

@@ -6,7 +6,7 @@ Needs the extra `cluster` (dask.distributed). Workers must see inputs and output
 import socket
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
@@ -25,7 +25,7 @@ def run_tasks(
     workers: int,
     limits: Limits,
     stop: Callable[[], bool] = lambda: False,
-) -> Iterator[Event]:
+) -> Generator[Event, None, None]:
     """Work through tasks on a cluster; events as they come (see `workers.run_tasks`).
 
     The scheduler gives a task to another worker when its own dies, as often as its `allowed-failures` says (3; with

@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from typing import Any
@@ -22,6 +22,8 @@ Report = Callable[[str, int, int], None]
 """(stage, done, total)."""
 _REPORT_EVERY_S = 0.2
 _WAIT_S = 0.5
+_STARTING = threading.Lock()
+"""One process at a time is started: each takes its number of threads from this one's environment."""
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -70,7 +72,7 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         arguments = (theirs, function, limits)
         self._process = context.Process(target=_work, args=arguments, name=f"rmis-calib-{number}", daemon=True)
-        with _environment(limits.threads):
+        with environment_of_threads(limits.threads):
             self._process.start()
         theirs.close()
         self.task: int | None = None
@@ -111,7 +113,7 @@ def run_tasks(
     workers: int,
     limits: Limits,
     stop: Callable[[], bool] = lambda: False,
-) -> Iterator[Event]:
+) -> Generator[Event, None, None]:
     """Work through tasks in processes; events as they come, in any order of the tasks.
 
     A task whose process dies goes to the end of the line, until its retries are used up. Closing the iterator kills
@@ -205,25 +207,27 @@ def _about_exit(code: int | None) -> str:
 
 
 @contextlib.contextmanager
-def _environment(threads: int) -> Iterator[None]:
+def environment_of_threads(threads: int) -> Iterator[None]:
     """Environment of new processes: libraries read their number of threads when they are loaded."""
     changes = dict.fromkeys(_THREAD_VARIABLES, str(threads)) | {"OMP_WAIT_POLICY": "PASSIVE"}
-    before = {name: os.environ.get(name) for name in changes}
-    os.environ.update(changes)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+    with _STARTING:
+        before = {name: os.environ.get(name) for name in changes}
+        os.environ.update(changes)
+        try:
+            yield
+        finally:
+            for name, value in before.items():
+                if value is None:
+                    del os.environ[name]
+                else:
+                    os.environ[name] = value
 
 
 def _work(connection: Connection, function: Callable[[Any, Report], Any], limits: Limits) -> None:
     """What a process does: one task after the other, until it gets None or its parent is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
-    _end_with_parent()
+    end_with_parent()
+    prefer_to_kill()
     _bound_memory(limits.memory_bytes)
     import torch
 
@@ -256,7 +260,8 @@ class Throttled:
         self._send(stage, done, total)
 
 
-def _end_with_parent() -> None:
+def end_with_parent() -> None:
+    """End this process when its parent does, however that dies."""
     parent = multiprocessing.parent_process()
     if parent is None:
         return
@@ -268,13 +273,16 @@ def _end_with_parent() -> None:
     threading.Thread(target=watch, daemon=True, name="rmis-parent").start()
 
 
+def prefer_to_kill() -> None:
+    """Make the kernel prefer this process to its parent when memory runs out."""
+    if sys.platform.startswith("linux"):
+        with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w", encoding="ascii") as file:
+            file.write("900")
+
+
 def _bound_memory(limit: int | None) -> None:
-    """Make an allocation beyond the limit fail in this process, and the kernel prefer it to its parent."""
-    if not sys.platform.startswith("linux"):
-        return
-    with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w", encoding="ascii") as file:
-        file.write("900")
-    if limit is not None:
+    """Make an allocation beyond the limit fail in this process."""
+    if limit is not None and sys.platform.startswith("linux"):
         import resource
 
         with contextlib.suppress(ValueError, OSError):

@@ -30,7 +30,14 @@ from rmis_calib.pipeline.motions.association import Choice, associate, associati
 from rmis_calib.pipeline.motions.consensus import with_consensus
 from rmis_calib.pipeline.motions.observations import assemble
 from rmis_calib.pipeline.pictures.background import about_background, without_background
-from rmis_calib.pipeline.pictures.detection import Progress, View, detect_recording, no_progress
+from rmis_calib.pipeline.pictures.detection import (
+    OWN_DETECTORS,
+    Detectors,
+    Progress,
+    View,
+    detect_recording,
+    no_progress,
+)
 from rmis_calib.pipeline.pictures.frozen import about_repeats, repeated_motions, without_frames
 from rmis_calib.results import CalibrationResult
 from rmis_calib.solver.problem import stands_still
@@ -74,8 +81,9 @@ def run_calibration(
     config: CalibrationConfig | None = None,
     progress: Progress = no_progress,
     segment: Segmenter | None = None,
+    detectors: Detectors = OWN_DETECTORS,
 ) -> CalibrationRun:
-    """The whole calibration, keeping what each step made.
+    """The whole calibration, keeping what each step made; `detectors` says who looks for shafts.
 
     Source: paper, Algorithm 1, with detection before it and a check of the answer after it.
     """
@@ -83,7 +91,7 @@ def run_calibration(
     require_device(config.device)
     prior = read_prior(config)
     recording, poses = _without_unknown_arm(recording, motion_poses(recording, config.device))
-    views, notes = _detect(recording, config, poses, progress, segment)
+    views, notes = _detect(recording, config, poses, progress, segment, detectors)
     with_pictures = config.look_again and config.masks is None and segment is None
     return calibrate_views(recording, config, poses, views, prior, notes, progress, with_pictures)
 
@@ -144,11 +152,12 @@ def _detect(
     poses: MotionPoses,
     progress: Progress,
     segment: Segmenter | None,
+    detectors: Detectors,
 ) -> tuple[tuple[View, ...], tuple[str, ...]]:
     """The views without pictures that repeat the one before while the joints moved, and without candidates that stand
     still while the instrument moves; a note for each such view."""
     kept, notes = [], []
-    for view in detect_recording(recording, config, progress, segment=segment):
+    for view in detect_recording(recording, config, progress, segment=segment, detectors=detectors):
         frames = poses.frames[repeated_motions(view.change, poses)]
         if len(frames):
             view = replace(view, detections=without_frames(view.detections, frames))

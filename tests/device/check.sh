@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# A GPU against the same machine's CPU in under 8 minutes: CUDA cases of the tests, the demo, detection and the solver.
+# A GPU against the same machine's CPU in under 8 minutes: CUDA cases of the tests, the demo, detection, the solver and
+# device batches over recordings.
 #
 #     bash tests/device/check.sh [--cpu] [--out FOLDER]
 #
@@ -48,7 +49,11 @@ demo() {
   "$python" -m rmis_calib demo --device "$1" --out "$out/demo_$1" --overwrite | tail -n 12
 }
 
-export -f tests demo
+batches() { # each worker its own, then all together: outputs must agree, and what it takes is printed
+  "$python" tests/benchmarks/bench_device_batch.py --device "$device" "$@"
+}
+
+export -f tests demo batches
 export python device out
 "$python" -c 'import sys, torch; sys.exit(0 if sys.argv[1] == "cpu" or torch.cuda.is_available() else "no CUDA device here (--cpu tries the script itself)")' "$device" || exit 2
 part "CUDA cases of the tests" 120 bash -c tests
@@ -56,6 +61,11 @@ if [ "$device" = cuda ]; then
   part "demo on the CPU" 60 bash -c "demo cpu"
 fi
 part "demo on $device" 60 bash -c "demo $device"
-part "detection and solver" 240 "$python" tests/device/measure.py --device "$device" $small
+part "detection and solver" 180 "$python" tests/device/measure.py --device "$device" $small
+if [ "$device" = cuda ]; then
+  part "batches over recordings" 120 bash -c "batches --recordings 8 --motions 48 --width 640 --workers 8"
+else
+  part "batches over recordings" 30 bash -c "batches --recordings 2 --motions 4 --workers 2"
+fi
 echo "left in $out"
 exit $failed

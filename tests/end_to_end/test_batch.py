@@ -11,13 +11,15 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pyarrow.parquet
 import pytest
 
 import rmis_calib as rc
-from rmis_calib.batches import JobRecord, plan, run
+from rmis_calib.batches import JobRecord, plan, work
 from rmis_calib.batches.summary import TIMES
 from rmis_calib.cli import main
 from rmis_calib.errors import InputError, OutputError
@@ -118,6 +120,19 @@ def test_what_is_done_is_passed_over_and_what_has_changed_is_done_again(tree, tm
 
 
 @pytest.mark.slow
+def test_pictures_searched_together_are_searched_as_each_alone(tree, tmp_path) -> None:
+    alone, together = tmp_path / "alone", tmp_path / "together"
+    settings = replace(ONE, workers=2, overlays=0)
+    rc.batch(tree, alone, task="detect", settings=settings)
+    rc.batch(tree, together, task="detect", settings=replace(settings, device_batch=32))
+    assert without_times(together / "summary.json") == without_times(alone / "summary.json")
+    for name in ("short", "deep/short"):
+        with np.load(alone / name / "lines.npz") as one, np.load(together / name / "lines.npz") as other:
+            assert all(one[key].tobytes() == other[key].tobytes() for key in one.files)
+        assert (together / name / "lines.csv").read_bytes() == (alone / name / "lines.csv").read_bytes()
+
+
+@pytest.mark.slow
 def test_nobodys_files_are_lost(tree, tmp_path) -> None:
     out = tmp_path / "out"
     rc.batch(tree / "deep", out, task="detect", settings=ONE)
@@ -150,7 +165,7 @@ def test_a_video_that_takes_the_decoder_down_fails_alone(rendered_pairs, tmp_pat
         shutil.copytree(rendered_pairs, tmp_path / "root" / name)
     out = tmp_path / "out"
     with monkeypatch.context() as patch:
-        patch.setattr(run, "run_job", toy_tasks.run_job_with_a_decoder_that_aborts)
+        patch.setattr(work, "run_job", toy_tasks.run_job_with_a_decoder_that_aborts)
         settings = rc.BatchSettings(workers=1, overlays=0, retries=1)
         crash, well = rc.batch(tmp_path / "root", out, task="detect", settings=settings).records
     assert (crash.outcome, crash.failure, well.outcome) == ("failed", "crash", "finished")

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import rmis_calib as rc
-from rmis_calib.batches import JobRecord, run
+from rmis_calib.batches import JobRecord, work
 from rmis_calib.batches.summary import TIMES
 from rmis_calib.errors import InputError
 from rmis_calib.parallel.processes import Event
@@ -86,7 +86,7 @@ def test_outputs_that_are_not_seen_from_here_are_a_clear_failure(rendered_pairs,
         record = JobRecord("recording", "", "calibrate", "", "finished", None, "fine", {"status": "ok"}, host="node7")
         yield Event(0, "finished", record, 1, 0)
 
-    monkeypatch.setattr(run.cluster, "run_tasks", elsewhere)
+    monkeypatch.setattr(work.cluster, "run_tasks", elsewhere)
 
     summary = rc.batch(rendered_pairs, tmp_path / "out", settings=rc.BatchSettings(cluster="tcp://host:1"))
     assert summary.records[0].failure == "output"

@@ -18,7 +18,7 @@ from rmis_calib.io import FrameBatch, FrameSource, Recording, load_recording, op
 from rmis_calib.pipeline.device import require_device
 from rmis_calib.pipeline.pictures.frozen import ChangeMeter
 from rmis_calib.pipeline.pictures.masks import MaskReader, open_masks
-from rmis_calib.vision import EndKind, FrameReason, ShaftDetections, ShaftDetector
+from rmis_calib.vision import DetectorSettings, EndKind, FrameReason, ShaftDetections, ShaftDetector
 from rmis_calib.vision.masks import Segmenter
 
 Progress = Callable[[str, int, int], None]
@@ -109,12 +109,31 @@ class DetectionTable:
         return rows
 
 
+@dataclass(frozen=True)
+class Detectors:
+    """Who looks for shafts: this process, on the device of the configuration, or another one that looks for many.
+
+    Attributes:
+        make: a detector from settings and camera.
+        pictures_on: device that decoded pictures go to; None: the configuration's.
+        at_once: batches under way; None: as many as the device does well.
+    """
+
+    make: Callable[[DetectorSettings, Camera | None], ShaftDetector] = ShaftDetector
+    pictures_on: str | None = None
+    at_once: int | None = None
+
+
+OWN_DETECTORS = Detectors()
+
+
 def detect(
     source: Recording | str | Path,
     config: CalibrationConfig | None = None,
     progress: Progress = no_progress,
     watch: Watch = no_watch,
     segment: Segmenter | None = None,
+    detectors: Detectors = OWN_DETECTORS,
 ) -> DetectionTable:
     """Find the shaft in a recording, or in a bare video, folder of images or image (then in pixels).
 
@@ -124,6 +143,7 @@ def detect(
         progress: called with (stage, done, total).
         watch: called with every batch of frames and what was found in it.
         segment: maps pictures (b, 3, h, w) in [0, 1] to masks, in place of `config.masks`.
+        detectors: who looks for shafts.
 
     Raises:
         FileError: the source, or `config.masks`, cannot be read.
@@ -134,11 +154,11 @@ def detect(
     if not isinstance(source, Recording) and (Path(source) / "recording.yaml").is_file():
         source = load_recording(source)
     if isinstance(source, Recording):
-        return DetectionTable(detect_recording(source, config, progress, watch, segment))
+        return DetectionTable(detect_recording(source, config, progress, watch, segment, detectors))
     frames = open_source(source)
     masks = open_masks(segment or config.masks, {"right": frames}, config.device, config.mask_labels)
     camera = _Camera("right", frames, frames.times_s, None, masks.get("right"), "detecting")
-    return DetectionTable(_detect_views([camera], config, progress, watch))
+    return DetectionTable(_detect_views([camera], config, progress, watch, detectors))
 
 
 def detect_recording(
@@ -147,6 +167,7 @@ def detect_recording(
     progress: Progress,
     watch: Watch = no_watch,
     segment: Segmenter | None = None,
+    detectors: Detectors = OWN_DETECTORS,
 ) -> tuple[View, ...]:
     """The right view, and the left one of a stereo recording."""
     rig = recording.stereo
@@ -159,7 +180,7 @@ def detect_recording(
         _Camera(side, source, recording.frame_times_s, camera, masks.get(side), f"detecting, {side}")
         for side, (source, camera) in views.items()
     ]
-    return _detect_views(cameras, config, progress, watch)
+    return _detect_views(cameras, config, progress, watch, detectors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +196,7 @@ class _Camera:
 
 
 def _detect_views(
-    cameras: list[_Camera], config: CalibrationConfig, progress: Progress, watch: Watch
+    cameras: list[_Camera], config: CalibrationConfig, progress: Progress, watch: Watch, detectors: Detectors
 ) -> tuple[View, ...]:
     """All cameras at once: their videos are decoded side by side, and the next batches while the last are searched."""
     parts: dict[str, list[ShaftDetections]] = {camera.side: [] for camera in cameras}
@@ -186,7 +207,7 @@ def _detect_views(
     for camera in cameras:
         progress(camera.stage, 0, wanted[camera.side])
     with ExitStack() as stack:
-        executor, at_once = stack.enter_context(_workers(config.device))
+        executor, at_once = stack.enter_context(detecting_threads(config.device, detectors.at_once))
         running: deque[tuple[_Camera, ShaftDetector, FrameBatch, Tensor | None, Future[ShaftDetections]]] = deque()
 
         def finish_one() -> None:
@@ -198,7 +219,7 @@ def _detect_views(
             done[camera.side] += len(batch.indices)
             progress(camera.stage, done[camera.side], wanted[camera.side])
 
-        for camera, detector, batch in _take_turns(cameras, config, stack):
+        for camera, detector, batch in _take_turns(cameras, config, detectors, stack):
             masks = None if camera.masks is None else camera.masks(batch)
             running.append((camera, detector, batch, masks, executor.submit(detector.detect, batch.images, masks)))
             if len(running) > at_once:
@@ -215,15 +236,16 @@ def _detect_views(
 
 
 def _take_turns(
-    cameras: list[_Camera], config: CalibrationConfig, stack: ExitStack
+    cameras: list[_Camera], config: CalibrationConfig, detectors: Detectors, stack: ExitStack
 ) -> Iterator[tuple[_Camera, ShaftDetector, FrameBatch]]:
     """A batch of each camera in turn until all are through; leaving the stack ends their decoding."""
     left = deque()
+    device = detectors.pictures_on or config.device
     for camera in cameras:
-        batches = camera.source.batches(config.batch_size, config.device, config.every)
+        batches = camera.source.batches(config.batch_size, device, config.every)
         stack.callback(batches.close)
-        moved = None if camera.camera is None else camera.camera.to(dtype=torch.float64, device=config.device)
-        left.append((camera, ShaftDetector(config.detector, moved), batches))
+        moved = None if camera.camera is None else camera.camera.to(dtype=torch.float64, device=device)
+        left.append((camera, detectors.make(config.detector, moved), batches))
     while left:
         camera, detector, batches = left.popleft()
         batch = next(batches, None)
@@ -233,14 +255,14 @@ def _take_turns(
 
 
 @contextmanager
-def _workers(device: str) -> Iterator[tuple[ThreadPoolExecutor, int]]:
+def detecting_threads(device: str, at_once: int | None = None) -> Iterator[tuple[ThreadPoolExecutor, int]]:
     """Threads that detect, and how many there are.
 
     Most steps of the search are small: on a CPU two batches beside each other, each on one core, are 15 per cent
     faster than one on both. Beyond four, threads wait for Python. A GPU takes one batch after the other.
     """
     threads = torch.get_num_threads()
-    count = min(threads, _MOST_WORKERS) if torch.device(device).type == "cpu" else 1
+    count = at_once or (min(threads, _MOST_WORKERS) if torch.device(device).type == "cpu" else 1)
     start = partial(torch.set_num_threads, max(1, threads // count))
     with ThreadPoolExecutor(count, thread_name_prefix="rmis-detect", initializer=start) as executor:
         try:
