@@ -111,6 +111,7 @@ def render_report(
         residuals=material.residuals,
         residual_sizes=details.residual_sizes(result),
         groups=details.groups(result),
+        tests=details.residual_tests(result),
         head_point_errors=details.head_point_errors(result),
         usage=usage(result),
         observability=observability(result.observability),

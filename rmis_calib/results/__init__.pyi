@@ -9,8 +9,10 @@ from .parts import KinematicOffsets as KinematicOffsets
 from .parts import Motions as Motions
 from .parts import Nuisance as Nuisance
 from .parts import Residual as Residual
+from .parts import ResidualTest as ResidualTest
 from .parts import Setup as Setup
 from .parts import Shift as Shift
+from .parts import Tests as Tests
 from .parts import covariance_of as covariance_of
 from .result import INSTRUMENT_BASE as INSTRUMENT_BASE
 from .result import INTRINSICS as INTRINSICS

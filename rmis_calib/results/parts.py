@@ -147,6 +147,49 @@ class Consistency:
         return {key: value for key, value in plain(self).items() if key != "clock_jump" or value is not None}
 
 
+@dataclass(frozen=True, config=FILE_PART)
+class ResidualTest:
+    """Whether residuals, or answers of parts of the data, hold what the model should have told."""
+
+    kind: str
+    """What is tested. In each camera (`_right`, `_left`): `shift` and `turn` of the shaft in the picture, `width`
+    between its edges, their `taper`, its `end`, the head point (`head_u`, `head_v`); a measurement of your own by its
+    name; the `answer` of parts of the data; the `clock`."""
+    over: str
+    """What it is tested over: its `mean`; the `time`, or a `time step` at one motion; where the camera sees the shaft
+    (`u`, `v`, and `r2`, the square about the centre); a joint by its column; `neighbours in time` or `neighbours in
+    joint space`; `halves` of the data."""
+    statistic: Number
+    """Standard normal where the model is right; of an answer its distance from that of the other part, in sigmas."""
+    probability: Number
+    """That some test of the whole list does as badly though the model is right (corrected for their number)."""
+    failed: bool
+    """Whether it takes the status `ok` away."""
+    before_motion: int | None
+    """Index of the first motion after the step; null for other tests."""
+    words: str
+    """What is left, in words."""
+
+
+@dataclass(frozen=True, config=FILE_PART)
+class Tests:
+    """The tests of a result, those that fail first."""
+
+    __test__ = False  # for pytest
+
+    level: Number
+    """Probability below which a test fails."""
+    tests: tuple[ResidualTest, ...]
+    """Each test, by its probability."""
+    causes: tuple[str, ...]
+    """What is likely to be wrong, the most likely first; none where every test passes."""
+
+    @property
+    def failed(self) -> tuple[ResidualTest, ...]:
+        """Those that fail."""
+        return tuple(test for test in self.tests if test.failed)
+
+
 @dataclass(frozen=True, eq=False, config=FILE_PART)
 class Information:
     """What a recording tells of the transform and of the unknowns that recordings of one set-up share, for pooling."""

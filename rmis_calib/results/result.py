@@ -34,6 +34,7 @@ from rmis_calib.results.parts import (
     Nuisance,
     Residual,
     Setup,
+    Tests,
 )
 from rmis_calib.solver.observability import Observability
 from rmis_calib.solver.settings import Method
@@ -120,6 +121,8 @@ class CalibrationResult:
     consistency: Consistency | None = None
     """Groups of neighbouring motions left out in turn, and parts of the data against each other; null for `paper` and
     `global`, and for few motions."""
+    tests: Tests | None = None
+    """Tests of what the model leaves in the residuals, and likely causes; absent for `paper` and `global`."""
     setup: Setup | None = None
     """The pose of one arm's base in the other's with the covariance of both transforms; absent where it was not
     estimated."""
@@ -194,7 +197,7 @@ class CalibrationResult:
     def to_dict(self) -> dict[str, Any]:
         """The result as plain JSON values, every number finite or None; the answer first."""
         record = record_type().dump_python(self, mode="json", by_alias=True)
-        for name in ("setup", "instrument_base"):  # as in results of before
+        for name in ("setup", "instrument_base", "tests"):  # as in results of before
             if record[name] is None:
                 del record[name]
         return {key: record[key] for key in (*_ANSWER, *record)}

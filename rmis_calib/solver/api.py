@@ -286,7 +286,7 @@ def _shaped(solution: Solution, batch: torch.Size) -> Solution:
     def shaped(value: Tensor) -> Tensor:
         return value.clone().reshape((*batch, *value.shape[1:]))
 
-    flat = ("observability", "posterior", "groups", "clock_jump", "history")
+    flat = ("observability", "posterior", "groups", "clock_jump", "tests", "causes", "history")
     return replace(
         solution,
         **{name: map_tensors(item, torch.clone if name in flat else shaped) for name, item in vars(solution).items()},

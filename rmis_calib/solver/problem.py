@@ -94,6 +94,7 @@ class Problem:
         clock_derivative: the same displacement per second of clock offset, and per unit by which the joints' clock runs
             faster than the video's (which is that times the time from the recording's middle), [motion, 6, 2].
         laparoscope_joints: how many of the joints, the first ones, are the laparoscope's.
+        joints: their readings, in their units, which residuals are tested over; None where they are not known.
         joint_offset_at: joint offsets at which the kinematics here were evaluated; None: zero.
         clock_at: clock offset, s, and rate, likewise.
         own: measurements of the user's own.
@@ -129,6 +130,7 @@ class Problem:
     laparoscope_base_T_instrument_base: Float[Tensor, "*batch 4 4"] | None = None
     setup_stated: Float[Tensor, "*batch 4 4"] | None = None
     laparoscope_joints: int = 0
+    joints: Float[Tensor, "*batch n j"] | None = None
 
     @property
     def batch_shape(self) -> torch.Size:

@@ -14,6 +14,7 @@ from rmis_calib.solver.observability import ObservabilityTensors, Verdict
 from rmis_calib.solver.settings import Method
 from rmis_calib.solver.status import SolveStatus
 from rmis_calib.solver.tensors import map_tensors
+from rmis_calib.solver.test_list import TestList
 
 
 @dataclass(frozen=True)
@@ -84,15 +85,6 @@ class Posterior:
     information: Float[Tensor, "b p p"]
 
 
-HALVES_APART = 4.49
-"""Distance of two halves in their sigmas, the 3-sigma bound of 6 unknowns, beyond which they contradict each other."""
-JUMPED = 4.5
-"""Size of a jump of the clock in its sigmas that chance makes at one of 32 borders in fewer than 3 of 10,000
-recordings."""
-CHANGED = 5.5
-"""Distance of before and after in their sigmas that chance makes in fewer than 3 of 10,000 recordings of 8 blocks."""
-
-
 @dataclass(frozen=True)
 class GroupCheck:
     """How the answer depends on groups of neighbouring motions, per trial.
@@ -143,11 +135,6 @@ class GroupCheck:
             change_at=torch.zeros_like(zero, dtype=torch.int64),
         )
 
-    @property
-    def contradicts(self) -> Bool[Tensor, " b"]:
-        """Whether parts of the data tell of different transforms."""
-        return (self.halves_sigmas > HALVES_APART) | (self.change_sigmas > CHANGED)
-
     def grown(self, covariance: Float[Tensor, "b 6 6"]) -> Float[Tensor, "b 6 6"]:
         """The covariance that says how far parts of the data are apart."""
         return self.growth @ covariance @ self.growth.mT
@@ -166,11 +153,6 @@ class ClockJump:
     jump_s: Float[Tensor, " b"]
     sigmas: Float[Tensor, " b"]
     at: Int[Tensor, " b"]
-
-    @property
-    def is_clear(self) -> Bool[Tensor, " b"]:
-        """Whether the clock jumps there."""
-        return self.sigmas > JUMPED
 
 
 @dataclass(frozen=True)
@@ -200,6 +182,9 @@ class Solution:
         posterior: what further motions would add to (assess/information.py); None for methods that estimate no noise.
         groups: what leaving out groups of neighbouring motions says, flat over trials; None for `paper` and `global`.
         clock_jump: the clearest jump of the clock, flat over trials; None where the clock is no unknown.
+        tests: all tests of residuals and answers, flat over trials; None for `paper` and `global`.
+        causes: what each usual cause of failed tests would lower chi^2 by, less the price of its unknowns
+            (assess/causes.py), flat over trials; empty where all pass.
         history: cost of accepted iterates of the refinement.
         frame: what `arm` is: `arm`, the laparoscope's; or `instrument_base` where the set-up is unknown and the
             laparoscope stands still: the pose of the instrument's base in the camera is then all there is to know.
@@ -234,6 +219,8 @@ class Solution:
     posterior: Posterior | None = None
     groups: GroupCheck | None = None
     clock_jump: ClockJump | None = None
+    tests: TestList | None = None
+    causes: dict[str, Float[Tensor, " b"]] = field(default_factory=dict)
     history: tuple[Float[Tensor, "..."], ...] = ()
     frame: str = "arm"
     setup: SetupEstimate | None = None
@@ -256,12 +243,9 @@ class Solution:
     def verdict(self) -> Int[Tensor, "*batch"]:
         """Codes of `Verdict`; a solve that did not converge is never better than unobservable."""
         verdict = self.observability.verdict.view_as(self.status)
-        if self.groups is not None:
-            not_above = verdict.clamp_min(Verdict.WEAK.code)
-            verdict = torch.where(self.groups.contradicts.view_as(verdict), not_above, verdict)
-        if self.clock_jump is not None:
-            not_above = verdict.clamp_min(Verdict.WEAK.code)
-            verdict = torch.where(self.clock_jump.is_clear.view_as(verdict), not_above, verdict)
+        if self.tests is not None:
+            failed = self.tests.failed.any(-1).view_as(verdict)
+            verdict = torch.where(failed, verdict.clamp_min(Verdict.WEAK.code), verdict)
         return torch.where(self.converged, verdict, Verdict.UNOBSERVABLE.code)
 
     @property
@@ -288,10 +272,15 @@ def concatenate(groups: list[Solution]) -> Solution:
         name: torch.cat([group.evidence.get(name, torch.full_like(group.cheirality, torch.nan)) for group in groups])
         for name in dict.fromkeys(name for group in groups for name in group.evidence)
     }
+    causes = {
+        name: torch.cat([group.causes.get(name, torch.full_like(group.cheirality, torch.nan)) for group in groups])
+        for name in dict.fromkeys(name for group in groups for name in group.causes)
+    }
     doubt = {
         name: torch.cat([group.doubt.get(name, torch.zeros_like(group.covariance)) for group in groups])
         for name in dict.fromkeys(name for group in groups for name in group.doubt)
     }
+    tests = dict.fromkeys(name for group in groups if group.tests is not None for name in group.tests.names)
     same = all(group.nuisances.keys() == names.keys() and group.posterior is not None for group in groups)
     still = all(group.instrument_base is not None for group in groups)
     parts = [
@@ -300,13 +289,15 @@ def concatenate(groups: list[Solution]) -> Solution:
             nuisances={},
             evidence={},
             doubt={},
+            causes={},
+            tests=None if group.tests is None else group.tests.among(tuple(tests)),
             setup=setup,
             posterior=group.posterior if same else None,
             instrument_base=group.instrument_base if still else None,
         )
         for group, setup in zip(groups, setups, strict=True)
     ]
-    return replace(_joined(parts), nuisances=nuisances, evidence=evidence, doubt=doubt)
+    return replace(_joined(parts), nuisances=nuisances, evidence=evidence, doubt=doubt, causes=causes)
 
 
 def _no_setup(group: Solution) -> SetupEstimate:

@@ -42,7 +42,8 @@ def map_tensors(value: Any, function: Callable[[Tensor], Tensor]) -> Any:
     if isinstance(value, dict):
         return {key: map_tensors(item, function) for key, item in value.items()}
     if isinstance(value, tuple):
-        return tuple(map_tensors(item, function) for item in value)
+        items = (map_tensors(item, function) for item in value)
+        return type(value)(*items) if hasattr(value, "_fields") else tuple(items)  # a named tuple stays one
     if is_dataclass(value) and not isinstance(value, type):
         return replace(
             value, **{field.name: map_tensors(getattr(value, field.name), function) for field in fields(value)}

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rmis_calib.geometry.rigid import RigidTransform, rigid_exp
 from rmis_calib.report.words.answer import covariance_text, inverse_covariance
-from rmis_calib.report.words.details import unknowns, unknowns_summary
+from rmis_calib.report.words.details import residual_tests, unknowns, unknowns_summary
 from rmis_calib.report.words.directions import observability
 from rmis_calib.report.words.formatting import fixed, significant, with_sigma
 from rmis_calib.report.words.verdict import verdict
@@ -133,19 +133,21 @@ def test_every_check_holds_for_a_trustworthy_result_and_one_fails_for_another(re
     ]
 
 
-def test_checks_name_the_part_of_the_data_that_disagrees(result_with) -> None:
-    shift = {"rotation_deg": 0.1, "translation_mm": 0.2, "sigmas": 1.5}
-    parts = {
-        "inflation": 1.0,
-        "group_by_motion": [0] * 60,
-        "groups": [shift | {"motions": 60}],
-        "halves": shift,
-        "change": shift | {"before_motion": 30},
-        "clock_jump": {"jump_s": 0.2, "sigmas": 9.0, "before_motion": 41},
-    }
-    found = verdict(result_with(status="weak", message="the clock jumps", consistency=parts)).checks
-    assert [check.passed for check in found] == [True, True, False]
-    assert found[-1].words == "Jump of the clock before motion 41: +0.200 s, 9.0 sigmas (limit 4.5)"
+def test_checks_name_the_tests_that_fail(result_with) -> None:
+    entry = {"statistic": 9.04, "probability": 1e-9, "before_motion": 41, "words": "the clock jumps before motion 41"}
+    failed = {"kind": "clock", "over": "time step", "failed": True} | entry
+    passed = {"kind": "shift_right", "over": "u", "failed": False, "words": "the shaft's place changes"}
+    tests = {"level": 0.005, "tests": [failed, entry | passed], "causes": ["frames were lost there"]}
+    result = result_with(status="weak", message="the clock jumps", tests=tests)
+    found = verdict(result).checks
+    assert [check.passed for check in found] == [False, False]
+    assert [check.words for check in found] == [
+        "The clock jumps before motion 41: 9.0 sigmas",
+        "Tests of the residuals: 1 of 2 pass",
+    ]
+    table = residual_tests(result)
+    assert table.failed == (("The clock jumps before motion 41", "9.0"),) and table.count == 2
+    assert dict(table.rows)["clock"] == (("9.0", True), ("", False)) and table.columns == ("step in time", "u")
 
 
 def test_importing_the_package_loads_nothing_heavy_and_charts_do_not_load_pyplot() -> None:

@@ -24,6 +24,7 @@ def everything(problem):
         laparoscope_base_T_arm=problem.arm_T_rcm,
         laparoscope_base_T_instrument_base=problem.arm_T_rcm[:, 0],
         setup_stated=problem.arm_T_rcm[:, 0],
+        joints=one[:, :, 0],
     )
 
 

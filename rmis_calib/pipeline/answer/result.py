@@ -16,6 +16,7 @@ from rmis_calib.pipeline.answer.setup_record import (
     instrument_base_of,
     setup_of,
 )
+from rmis_calib.pipeline.answer.tests_in_words import told_tests
 from rmis_calib.pipeline.arms.poses import MotionPoses
 from rmis_calib.pipeline.motions.association import Choice
 from rmis_calib.pipeline.motions.observations import reasons_for
@@ -36,12 +37,13 @@ from rmis_calib.results import (
     Residual,
     Shift,
     Status,
+    Tests,
 )
 from rmis_calib.robot import split_joint_column
 from rmis_calib.solver import Solution, SolveStatus, Verdict
 from rmis_calib.solver.observability import Observability
-from rmis_calib.solver.solution import CHANGED, GroupCheck
 from rmis_calib.solver.status import MotionReason
+from rmis_calib.solver.test_list import ANSWER, CLOCK, HALVES, TIME_STEP
 
 JOINTS_UNKNOWN = "the joint log does not cover this time"
 TOO_FEW = "usable, but there are too few"
@@ -70,7 +72,8 @@ def make_result(
     """The result of one solve (no trial batch); `joint_columns` name its joint offsets, `notes` join what is said of
     the data, `frame` is what the motions call `arm` (default: what the solution calls it), `names` are the motions'."""
     frame = frame or solution.frame
-    status, message = judge(solution, names)
+    tests = told_tests(solution, joint_columns, names)
+    status, message = judge(solution, tests)
     consistency = consistency_of(solution)
     observability = solution.observability.describe()
     notes = (
@@ -97,6 +100,7 @@ def make_result(
         residuals=residuals,
         nuisances=_nuisances(solution, joint_columns),
         consistency=consistency,
+        tests=tests,
         setup=setup_of(solution),
         instrument_base=instrument_base_of(solution),
         information=_information(solution),
@@ -133,8 +137,9 @@ def _about_ends(solution: Solution) -> tuple[str, ...]:
     )
 
 
-def judge(solution: Solution, names: MotionNames = NUMBERED) -> tuple[Status, str]:
-    """Status and its one line: a solve that did not work first, then a model that does not fit, then sight."""
+def judge(solution: Solution, tests: Tests | None) -> tuple[Status, str]:
+    """Status and its one line: a solve that did not work first, then a model that does not fit, then tests that fail,
+    then sight."""
     status = SolveStatus(int(solution.status))
     verdict = Verdict.of(solution.observability.verdict[0])
     strange = _strange_unknown(solution)
@@ -143,15 +148,8 @@ def judge(solution: Solution, names: MotionNames = NUMBERED) -> tuple[Status, st
         return "solver_failed", f"{why}; {strange}" if strange else why
     if strange:
         return "weak", f"{STATUS_SENTENCES['weak']}: {strange}"
-    jump = solution.clock_jump
-    if jump is not None and bool(jump.is_clear):
-        return "weak", (
-            f"Pictures and joints lose each other: the clock jumps by {float(jump.jump_s):+.3f} s before "
-            f"{names.one(int(jump.at))}. Likely: frames or samples were lost there; then: the frame rate, or the "
-            "camera moved"
-        )
-    if solution.groups is not None and bool(solution.groups.contradicts):
-        return "weak", f"Parts of the data contradict each other: {_contradiction(solution.groups, names)}"
+    if tests is not None and tests.failed:
+        return "weak", _about_failed(solution, tests)
     name: Status = "ok" if verdict is Verdict.TRUSTWORTHY else verdict.value
     return name, f"{STATUS_SENTENCES[name]}: {solution.observability.describe().sentences[0]}"
 
@@ -301,19 +299,17 @@ def about_cameras(solution: Solution) -> tuple[str, ...]:
     return (f"The data suggest corrected cameras: {'; '.join(said)}. The transform goes with them.",)
 
 
-def _contradiction(groups: GroupCheck, names: MotionNames) -> str:
-    """Which parts of the data tell of different transforms."""
-    if float(groups.change_sigmas) > CHANGED:
-        return (
-            f"the motions before and after {names.one(int(groups.change_at))} differ by {_apart(groups.change[0])}, "
-            "more than their sigmas allow: did the camera, a trocar or an arm's base move there?"
-        )
-    number, first = groups.group[0].cpu().numpy(), groups.first_half[0].cpu().numpy()
-    half = names.some((number >= 0) & first[number], number >= 0)
-    return (
-        f"the {half} disagree with the rest by {_apart(groups.halves[0])}, more than their sigmas allow: errors "
-        "outside the model (lens, focal length, an arm's base, joints) exceed the noise"
-    )
+def _about_failed(solution: Solution, tests: Tests) -> str:
+    """The clearest of the failed tests, how many more fail, and the likely causes."""
+    worst, more = tests.failed[0], len(tests.failed) - 1
+    groups, jump, size = solution.groups, solution.clock_jump, f"{worst.statistic:+.1f} sigmas"
+    if (worst.kind, worst.over) == (CLOCK, TIME_STEP) and jump is not None:
+        size = f"{float(jump.jump_s):+.3f} s"
+    elif worst.kind == ANSWER and groups is not None:
+        size = f"{_apart((groups.halves if worst.over == HALVES else groups.change)[0])} apart"
+    rest = f", and {more} more tests fail" if more > 1 else ", and one more test fails" if more else ""
+    causes = "; then: ".join(tests.causes)
+    return f"The residuals are not what the model says: {worst.words} ({size}){rest}. Likely: {causes}"
 
 
 def _apart(gap: torch.Tensor) -> str:

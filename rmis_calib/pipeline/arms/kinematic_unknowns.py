@@ -84,6 +84,7 @@ class KinematicUnknowns(OffsetUnknowns):
             valid=repeated.valid & known[:, None],
             joint_offset_at=joint_offset,
             clock_at=clock,
+            joints=readings,
         )
 
     def joint_derivative(

@@ -9,7 +9,8 @@ import numpy as np
 from rmis_calib.io.plain_values import finite_or_none
 from rmis_calib.report.charts.residuals import COLOURS, robust_scale
 from rmis_calib.report.words.formatting import significant, tiny_as_zero, with_sigma
-from rmis_calib.results import CalibrationResult, Residual
+from rmis_calib.results import CalibrationResult, Residual, ResidualTest
+from rmis_calib.solver.test_list import HALVES, MEAN, NEAR_IN_JOINTS, NEAR_IN_TIME, TIME, TIME_STEP
 
 _MEASUREMENTS = {
     "contour": "Contours, distance of both edges",
@@ -17,6 +18,21 @@ _MEASUREMENTS = {
     "end": "Shaft end, distance along the shaft",
     "head": "Head point, distance",
 }
+
+
+_TESTED_KINDS = ("answer", "clock", "shift", "turn", "width", "taper", "end", "head")
+_TESTED_OVER = {
+    MEAN: "mean",
+    TIME: "time",
+    TIME_STEP: "step in time",
+    NEAR_IN_TIME: "next motion",
+    NEAR_IN_JOINTS: "nearest motion",
+    HALVES: "halves",
+    "u": "u",
+    "v": "v",
+    "r2": "r²",
+}
+"""What residuals are tested over, as the table heads it, joints last."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +68,27 @@ class GroupRow:
     rotation_deg: str
     translation_mm: str
     sigmas: str
+
+
+@dataclass(frozen=True)
+class TestTable:
+    """Tests of the residuals.
+
+    Attributes:
+        failed: words and sigmas of those that fail.
+        causes: likely ones, in words.
+        columns: what tests are over.
+        rows: each kind with its cells: sigmas, and whether the test fails.
+        count: number of tests.
+    """
+
+    __test__ = False  # for pytest
+
+    failed: tuple[tuple[str, str], ...]
+    causes: tuple[str, ...]
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, tuple[tuple[str, bool], ...]], ...]
+    count: int
 
 
 def unknowns(result: CalibrationResult) -> tuple[Row, ...]:
@@ -111,6 +148,33 @@ def groups(result: CalibrationResult) -> tuple[GroupRow, ...]:
         )
         for number, group in enumerate(result.consistency.groups)
     )
+
+
+def residual_tests(result: CalibrationResult) -> TestTable | None:
+    """The tests of the residuals: kinds down, what they are over across; None without tests."""
+    if result.tests is None or not result.tests.tests:
+        return None
+    by_name = {(test.kind, test.over): test for test in result.tests.tests}
+    kinds = dict.fromkeys(sorted({kind for kind, _ in by_name}, key=_kind_order))
+    overs = list(dict.fromkeys(over for over in (*_TESTED_OVER, *sorted({over for _, over in by_name}))))
+    overs = [over for over in overs if any((kind, over) in by_name for kind in kinds)]
+    rows = tuple((kind.replace("_", " "), tuple(_cell(by_name.get((kind, over))) for over in overs)) for kind in kinds)
+    columns = tuple(_TESTED_OVER.get(over, over.replace("_", " ")) for over in overs)
+    failed = tuple(
+        (f"{test.words[:1].upper()}{test.words[1:]}", significant(test.statistic, 2)) for test in result.tests.failed
+    )
+    return TestTable(failed, result.tests.causes, columns, rows, len(by_name))
+
+
+def _kind_order(kind: str) -> tuple[int, str]:
+    """Those that every recording has first."""
+    first = [name for name in _TESTED_KINDS if kind.startswith(name)]
+    return (_TESTED_KINDS.index(first[0]) if first else len(_TESTED_KINDS), kind)
+
+
+def _cell(test: ResidualTest | None) -> tuple[str, bool]:
+    """Sigmas, and whether the test fails."""
+    return ("", False) if test is None or test.statistic is None else (f"{test.statistic:.1f}", test.failed)
 
 
 def head_point_errors(result: CalibrationResult) -> tuple[tuple[str, ...], ...]:

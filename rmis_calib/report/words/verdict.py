@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 from rmis_calib.pipeline.answer.result import JOINTS_UNKNOWN, TOO_FEW
 from rmis_calib.pipeline.motions.observations import ANOTHER_INSTRUMENT, DIRECTION_UNKNOWN
 from rmis_calib.report.words.formatting import finite, significant
-from rmis_calib.results import STATUS_SENTENCES, CalibrationResult
+from rmis_calib.results import STATUS_SENTENCES, CalibrationResult, ResidualTest
 from rmis_calib.solver import MotionReason
-from rmis_calib.solver.solution import CHANGED, HALVES_APART, JUMPED
 from rmis_calib.vision import FrameReason
 
+_SHOWN_FAILED = 3
+"""Failed tests of residuals that stand among the checks; all are in the table."""
 WORTH_MOVING = 0.95
 """An advised motion that leaves more than this part of the weakest sigma is not worth the effort."""
 
@@ -76,7 +77,7 @@ def verdict(result: CalibrationResult) -> Verdict:
 
 def checks(result: CalibrationResult, reason: str) -> tuple[Check, ...]:
     """What the verdict rests on. Where all of these hold and the result is still not trustworthy, the reason is one."""
-    found = [*_error_checks(result), *_consistency_checks(result)]
+    found = [*_error_checks(result), *_residual_checks(result)]
     if result.status in ("insufficient_data", "solver_failed") or not found:
         return ()
     if not result.trustworthy and all(check.passed for check in found):
@@ -100,27 +101,21 @@ def _error_checks(result: CalibrationResult) -> list[Check]:
     return found
 
 
-def _consistency_checks(result: CalibrationResult) -> list[Check]:
-    """Whether parts of the data agree."""
-    consistency = result.consistency
-    if consistency is None:
+def _residual_checks(result: CalibrationResult) -> list[Check]:
+    """Whether tests of residuals, and of parts of the data against each other, pass; the worst of those that do not."""
+    tests = result.tests
+    if tests is None or not tests.tests:
         return []
-    found = []
-    halves, change = finite(consistency.halves.sigmas), finite(consistency.change.sigmas)
-    if halves is not None:
-        words = f"Two halves of the motions: {halves:.1f} of their sigmas apart (limit {HALVES_APART:g})"
-        found.append(Check(halves <= HALVES_APART, words))
-    if change is not None:
-        words = (
-            f"Before and after motion {consistency.change.before_motion}: {change:.1f} sigmas apart (limit {CHANGED:g})"
-        )
-        found.append(Check(change <= CHANGED, words))
-    jump = consistency.clock_jump
-    sigmas, jump_s = (None, None) if jump is None else (finite(jump.sigmas), finite(jump.jump_s))
-    if jump is not None and sigmas and jump_s:  # none where the clock could not be told
-        words = f"Jump of the clock before motion {jump.before_motion}: {jump_s:+.3f} s, {sigmas:.1f} sigmas"
-        found.append(Check(sigmas <= JUMPED, f"{words} (limit {JUMPED:g})"))
-    return found
+    failed, count = tests.failed, len(tests.tests)
+    found = [
+        Check(False, f"{test.words[:1].upper()}{test.words[1:]}: {_sigmas(test)}") for test in failed[:_SHOWN_FAILED]
+    ]
+    words = f"Tests of the residuals: {count - len(failed)} of {count} pass"
+    return [*found, Check(not failed, words)]
+
+
+def _sigmas(test: ResidualTest) -> str:
+    return f"{significant(test.statistic, 2)} sigmas"
 
 
 def next_steps(result: CalibrationResult) -> tuple[tuple[str, ...], tuple[str, ...]]:

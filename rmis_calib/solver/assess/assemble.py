@@ -8,12 +8,14 @@ from torch import Tensor
 
 from rmis_calib.geometry.rigid import rigid_exp, rigid_from_rotation_translation, rigid_inverse, rigid_log
 from rmis_calib.geometry.rotations import matrix_to_rotvec
+from rmis_calib.solver.assess.causes import causes_of
 from rmis_calib.solver.assess.clock_jump import find_clock_jump
 from rmis_calib.solver.assess.evidence import Evidence
 from rmis_calib.solver.assess.groups import check_groups
 from rmis_calib.solver.assess.instrument_base import instrument_base
 from rmis_calib.solver.assess.left_out import reported
 from rmis_calib.solver.assess.observability import assess, detect_degeneracies, turns_about_one_axis
+from rmis_calib.solver.assess.residual_tests import answer_tests, fit_tests
 from rmis_calib.solver.estimate.map_estimate import MapEstimate
 from rmis_calib.solver.estimate.multistart import cheirality
 from rmis_calib.solver.estimate.noise_levels import COMPONENTS, assumed_noise
@@ -122,6 +124,8 @@ def joint_solution(
     groups = check_groups(fit, settings.groups)
     C = groups.grown(C)
     jump = find_clock_jump(fit, excess, groups)
+    tests = answer_tests(groups, jump, measured.motions).joined(fit_tests(fit, settings))
+    causes = causes_of(fit, groups, jump, excess) if bool(tests.failed.any()) else {}
     setup = _setup(fit, excess, groups, evidence)
     for name in evidence.doubt.keys() - {"setup"}:
         C = C + evidence.doubt[name][:, :6, :6]
@@ -151,6 +155,8 @@ def joint_solution(
         bias=fit.bias[:, :6],
         groups=groups,
         clock_jump=jump,
+        tests=tests,
+        causes=causes,
         setup=setup,
         instrument_base=base,
         evidence=evidence.chance,

@@ -16,6 +16,7 @@ The same pairs correct the information: noise in J inflates J^T S^-1 J by its ow
 that to second order.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -129,6 +130,19 @@ def simulate(measured: MeasurementRows, state: State, noise: NoiseModel, draws: 
 def _uncorrected(xy: Float[Tensor, "2 c b n"], state: State) -> Float[Tensor, "2 c b n"]:
     """The points whose correction these are, to first order."""
     return 2.0 * xy - corrected_points(xy, state)
+
+
+def simulated_pairs(
+    model: WeightedModel, state: State, repeats: int, seed: int
+) -> Iterator[tuple[WeightedModel, State]]:
+    """The model with simulated measurements at the state: twice its trials, first with one sign of the noise, then with
+    the other."""
+    generator = torch.Generator(device=model.measured.p.device).manual_seed(seed)
+    twice = torch.arange(model.measured.trials, device=model.measured.p.device).repeat(2)
+    both, at = model.take_trials(twice), state.take(twice)
+    for _ in range(repeats):
+        draws = _Draws(model.measured, generator)
+        yield replace(both, measured=simulate(both.measured, at, both.noise, draws)), at
 
 
 def expected_score(model: WeightedModel, state: State, simulated_motions: int, seed: int) -> ScoreBias:

@@ -214,6 +214,11 @@ def normal_equations(model: WeightedModel, state: State, keep: bool = False) -> 
     )
 
 
+def summed_products(model: WeightedModel, white: Float[Tensor, "k q b n"]) -> Float[Tensor, "b p p"]:
+    """Products of all columns, the residuals' last, from `whitened_columns` without further ones."""
+    return _sums(model, white, None)[:, 0]
+
+
 def _sums(
     model: WeightedModel, white: Float[Tensor, "k q b n"], member: Float[Tensor, "b n g"] | None
 ) -> Float[Tensor, "b g p p"]:
@@ -253,17 +258,32 @@ def member_sums(
     return joined[..., :-1, :-1], joined[..., :-1, -1]
 
 
+def whitened_columns(
+    model: WeightedModel, state: State, linear: LinearisedRows, shaft: Shaft, more: Float[Tensor, "k m b n"]
+) -> Float[Tensor, "k q b n"]:
+    """L^-1 [more J r] of motions that fit into memory at once: further columns, those of the folded layout, and the
+    residuals."""
+    return _eliminated(model, state, linear, shaft, more)[0]
+
+
 def _eliminated(
-    model: WeightedModel, state: State, linear: LinearisedRows, shaft: Shaft
+    model: WeightedModel,
+    state: State,
+    linear: LinearisedRows,
+    shaft: Shaft,
+    more: Float[Tensor, "k m b n"] | None = None,
 ) -> tuple[Float[Tensor, "k q b n"], Tensor]:
     """L^-1 [J r] of every motion, with S = L L^T and the columns of the folded layout, and the eliminated systems; in
-    place, not for autograd."""
+    place, not for autograd. Further columns come before."""
     measured, layout = model.measured, model.layout.folded
     k, b, n = linear.r.shape
+    first = k if more is None else k + more.shape[1]
     image = image_variance(measured, model.noise)
-    augmented = torch.empty((k, k + layout.size + 1, b, n), dtype=linear.r.dtype, device=linear.r.device)
+    augmented = torch.empty((k, first + layout.size + 1, b, n), dtype=linear.r.dtype, device=linear.r.device)
     covariance(linear.w, linear.a, image, measured.cameras, model.noise, augmented[:, :k], model.weight)
-    columns(layout, linear, shaft, measured, state, out=augmented[:, k:-1])
+    if more is not None:
+        augmented[:, k:first] = more
+    columns(layout, linear, shaft, measured, state, out=augmented[:, first:-1])
     augmented[:, -1] = linear.r
     eliminate(augmented)
     factor = augmented[:, :k]

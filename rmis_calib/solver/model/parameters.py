@@ -278,7 +278,7 @@ def columns(
         out: where to write it; not where autograd looks on.
     """
     if linear.r.requires_grad:
-        blocks = [_columns_of(name, linear, shaft, measured, state) for name in layout.blocks]
+        blocks = [columns_of(name, linear, shaft, measured, state) for name in layout.blocks]
         return torch.cat(blocks).transpose(0, 1)
     if out is None:
         out = linear.r.new_empty((linear.r.shape[0], layout.size, *linear.r.shape[1:]))
@@ -299,11 +299,11 @@ def columns(
                 target.copy_(linear.w[:, 1::2])
     for name, part in layout.blocks.items():
         if name not in ("rotation", "translation", "stereo_rotation", "stereo_translation"):
-            by_parameter[part] = _columns_of(name, linear, shaft, measured, state)
+            by_parameter[part] = columns_of(name, linear, shaft, measured, state)
     return out
 
 
-def _columns_of(
+def columns_of(
     name: str, linear: LinearisedRows, shaft: Shaft, measured: MeasurementRows, state: State
 ) -> Float[Tensor, "q k b n"]:
     """Columns of one block, without writing in place."""

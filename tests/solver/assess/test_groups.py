@@ -128,7 +128,8 @@ def test_a_camera_that_was_knocked_is_told_and_not_believed(simulate, realistic,
     config = parse_config({"solver": {"noise": {"estimate": "never"}}})
     result = rc.solve(knocked(realistic, angle, simulate), config, throw=False)
     assert result.status == "weak"
-    assert "the motions before and after motion 32 differ" in result.message
+    assert "the motions before and after motion 32 give different answers" in result.message
+    assert result.tests is not None and "moved before motion 32" in result.tests.causes[0]
     change = result.consistency.change
     assert change.sigmas > 5.5
     assert change.rotation_deg == pytest.approx(np.rad2deg(angle), abs=0.5)

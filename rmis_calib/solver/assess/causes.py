@@ -1,0 +1,162 @@
+"""What a failed test is likely to come from: score tests of what usually goes wrong.
+
+Each cause has columns: what a unit of it would do to every row. With u their score and A their information, the
+parameters of the fit eliminated, freeing the cause would lower chi^2 by u^T A^-1 u (Rao 1948); the more columns, the
+less that means (Schwarz 1978: each costs the logarithm of the number of places). What an unknown of the fit already
+took, within its prior, counts for its cause: a lens that is pulled from its nominal value is not exonerated by fitting.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rmis_calib.solver.assess.tested_over import over_of
+from rmis_calib.solver.estimate.map_estimate import MapEstimate
+from rmis_calib.solver.model.batched_linalg import batch_last, cross, dot, rotate
+from rmis_calib.solver.model.linearised_rows import LinearisedRows
+from rmis_calib.solver.model.measurement_rows import MeasurementRows
+from rmis_calib.solver.model.normal_equations import WeightedModel, summed_products, whitened_columns
+from rmis_calib.solver.model.parameters import columns_of
+from rmis_calib.solver.model.predicted_shaft import Shaft, rcm_axes
+from rmis_calib.solver.model.residuals import linearise
+from rmis_calib.solver.model.state import State
+from rmis_calib.solver.solution import ClockJump, GroupCheck
+
+TESTED_MOTIONS = 2048
+"""Causes in long recordings are told from a sample."""
+CAUSES = ("clock", "clock jump", "camera moved", "intrinsics", "lens", "stereo", "setup", "tool", "joint_offset")
+LENGTH_MM = 100.0
+"""Distance from the RCM at which the bend of a unit is one."""
+SEEN = 1e-4
+"""Part of a direction's information that the fit must leave for it to count."""
+
+
+def causes_of(
+    fit: MapEstimate, groups: GroupCheck, jump: ClockJump | None, excess: Float[Tensor, " b"]
+) -> dict[str, Float[Tensor, " b"]]:
+    """By how much each cause would lower chi^2, less the price of its columns; NaN or absent where the data do not tell
+    it.
+
+    Args:
+        fit: the estimate.
+        groups: of neighbouring motions.
+        jump: of the clock.
+        excess: what the residuals exceed the noise by, as a factor on the variance.
+    """
+    step = -(-fit.model.measured.motions // TESTED_MOTIONS)
+    model = fit.model
+    if step > 1:
+        model = model.take_motions(torch.arange(0, model.measured.motions, step, device=fit.state.t.device))
+    state = fit.state.moved(model.layout.step(fit.bias))
+    levels = model.noise.kinematics_mm.sqrt(), model.noise.kinematics_rad.sqrt()
+    places = (over_of(model.measured, levels, None).cluster[:, -1] + 1.0).clamp_min(3.0)
+    price, excess = places.log(), excess.clamp_min(1.0)
+    sums, parts = _sums(model, state)
+    own = slice(0, model.layout.size)
+    H = sums[:, own, own] + torch.diag_embed(model.layout.sigma.square().reciprocal()) / step
+    found = {}
+    for name, part in parts.items():
+        gain, freedom = _gain(sums, H, part)
+        found[name] = gain * step / excess - freedom * price
+    for name, index in _fitted(model).items():
+        deviation = fit.model.layout.prior(fit.state)[0][:, index]
+        C = fit.covariance[:, index][:, :, index]
+        taken = (deviation * torch.linalg.solve_ex(C, deviation[..., None]).result[..., 0]).sum(-1)
+        found[name] = found[name] + torch.nan_to_num(taken).clamp_min(0.0) / excess
+    inflation = groups.inflation.square()
+    if groups.count:
+        found["camera moved"] = groups.change_sigmas.square() * inflation - 7.0 * price
+    if jump is not None:
+        found["clock jump"] = jump.sigmas.square() * inflation - 2.0 * price
+    return found
+
+
+def _fitted(model: WeightedModel) -> dict[str, list[int]]:
+    """Parameters of the fit that are a cause themselves."""
+    blocks = {name: list(range(part.start, part.stop)) for name, part in model.layout.blocks.items()}
+    intrinsics = blocks.get("intrinsics", [])
+    found = {
+        "intrinsics": [index for index in intrinsics if index not in intrinsics[3::4]],
+        "lens": intrinsics[3::4],
+        "stereo": blocks.get("stereo_rotation", []) + blocks.get("stereo_translation", []),
+    }
+    return {name: index for name, index in found.items() if index}
+
+
+def _sums(model: WeightedModel, state: State) -> tuple[Float[Tensor, "b q q"], dict[str, slice]]:
+    """Products of the columns of the fit, of every cause, and of the residuals, summed over motions; and where each
+    cause is."""
+    total, places = [], {}
+    for trials, along in model.parts():
+        at, sums = state.take(trials), 0.0
+        for motions in along:
+            part = model.narrow(trials, motions)
+            linear, shaft = linearise(part.measured, at)
+            each = _columns(part.measured, at, linear, shaft)
+            more = torch.cat(list(each.values())).transpose(0, 1)
+            white = whitened_columns(part, at, linear, shaft, more)
+            m = more.shape[1]
+            start = 0
+            for name, columns in each.items():
+                places[name] = slice(model.layout.size + start, model.layout.size + start + len(columns))
+                start += len(columns)
+            sums = sums + summed_products(part, torch.cat((white[:, m:-1], white[:, :m], white[:, -1:]), dim=1))
+        total.append(sums)
+    return torch.nan_to_num(torch.cat(total)), places
+
+
+def _columns(
+    measured: MeasurementRows, state: State, linear: LinearisedRows, shaft: Shaft
+) -> dict[str, Float[Tensor, "q k b n"]]:
+    """Effect of a unit of each cause on every row, of those causes that the measurements tell of."""
+
+    def effect(*names: str) -> Float[Tensor, "q k b n"]:
+        return torch.cat([columns_of(name, linear, shaft, measured, state) for name in names])
+
+    cameras = effect("intrinsics").unflatten(0, (-1, 4))  # focal length, centre x and y, lens of each
+    found = {
+        "intrinsics": cameras[:, :3].flatten(0, 1),
+        "lens": cameras[:, 3],
+        "tool": _bend(measured, state, linear, shaft),
+    }
+    found["tool"] = torch.cat((found["tool"], effect("rcm_offset")))
+    if measured.cameras == 2:
+        found["stereo"] = effect("stereo_rotation", "stereo_translation")
+    if measured.clock is not None:
+        found["clock"] = effect("clock_rate")
+    if measured.setup is not None:
+        found["setup"] = effect("setup")
+    if measured.joint is not None and measured.joint.shape[1]:
+        found["joint_offset"] = effect("joint_offset")
+    return found
+
+
+def _bend(measured: MeasurementRows, state: State, linear: LinearisedRows, shaft: Shaft) -> Float[Tensor, "2 k b n"]:
+    """Effect of a bend of the shaft, the square of the distance from the RCM, in two directions fixed to `rcm`.
+
+    A row is w.(tau + phi x s d), so that a = s d x w (residuals.py), which tells the s that it sees.
+    """
+    d, R = shaft.d[:, :1], batch_last(state.R, 2)[..., None]
+    lever = cross(d, linear.w)
+    s = dot(linear.a, lever) / dot(lever, lever).clamp_min(1e-30)
+    return torch.stack(
+        [dot(linear.w, rotate(R, e)[:, None]) * (s / LENGTH_MM).square() for e in rcm_axes(measured.R, measured.v)]
+    )
+
+
+def _gain(
+    sums: Float[Tensor, "b q q"], H: Float[Tensor, "b p p"], part: slice
+) -> tuple[Float[Tensor, " b"], Float[Tensor, " b"]]:
+    """By how much freeing the columns `part` would lower chi^2, and in how many directions they are seen."""
+    p = H.shape[-1]
+    cross_, u = sums[:, :p, part], sums[:, part, -1]
+    size = H.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
+    unit = sums[:, part, part].diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
+    scaled = cross_ * size[..., None] * unit[:, None]
+    others = H * size[:, :, None] * size[:, None] + 1e-12 * torch.eye(p, dtype=H.dtype, device=H.device)
+    taken = scaled.mT @ torch.linalg.solve_ex(others, scaled).result
+    A = sums[:, part, part] * unit[:, :, None] * unit[:, None] - taken
+    values, vectors = torch.linalg.eigh(torch.nan_to_num(0.5 * (A + A.mT)))
+    along = (vectors.mT @ torch.nan_to_num(u * unit)[..., None])[..., 0]
+    seen = values > SEEN
+    return torch.where(seen, along.square() / values.clamp_min(SEEN), 0.0).sum(-1), seen.sum(-1).to(u)
