@@ -24,6 +24,7 @@ from rmis_calib.pipeline.arms.offset_unknowns import estimated_offsets
 from rmis_calib.pipeline.arms.poses import MotionPoses, frame_of, motion_poses
 from rmis_calib.pipeline.checks.findings import about_motions, about_order
 from rmis_calib.pipeline.checks.misfit import with_misfit_named
+from rmis_calib.pipeline.checks.picture_check import with_picture_check
 from rmis_calib.pipeline.device import require_device
 from rmis_calib.pipeline.evaluation import head_point_errors, summarise_head_points
 from rmis_calib.pipeline.motions.association import Choice, associate, association_gate, consistent_choice, read_prior
@@ -92,8 +93,10 @@ def run_calibration(
     prior = read_prior(config)
     recording, poses = _without_unknown_arm(recording, motion_poses(recording, config.device))
     views, notes = _detect(recording, config, poses, progress, segment, detectors)
-    with_pictures = config.look_again and config.masks is None and segment is None
-    return calibrate_views(recording, config, poses, views, prior, notes, progress, with_pictures)
+    own_masks = segment is not None or config.masks is not None
+    with_pictures = config.look_again and not own_masks
+    run = calibrate_views(recording, config, poses, views, prior, notes, progress, with_pictures)
+    return with_picture_check(run, own_masks)
 
 
 def calibrate_views(

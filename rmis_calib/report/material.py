@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rmis_calib.pipeline.answer.run import CalibrationRun
+from rmis_calib.report.charts.picture_edges import EdgeMap, edge_maps
 from rmis_calib.report.charts.residuals import ResidualFigure, residual_figures
 from rmis_calib.report.charts.signed import residual_evidence
 from rmis_calib.report.drawing.choosing import ShownMotions, choose_motions
@@ -28,6 +29,7 @@ class ReportMaterial:
         sheets: rejected motions by reason.
         working_point: the answer's sigma on a frame.
         residuals: drawn with their sign.
+        edge_maps: edges of the pictures off the predicted contours.
         scene: both arms, cameras and the instrument in three dimensions.
     """
 
@@ -36,6 +38,7 @@ class ReportMaterial:
     sheets: tuple[RejectionSheet, ...] = ()
     working_point: WorkingPointPicture | None = None
     residuals: tuple[ResidualFigure, ...] = ()
+    edge_maps: tuple[EdgeMap, ...] = ()
     scene: SceneDrawing | None = None
 
     @property
@@ -54,6 +57,7 @@ def gather_material(run: CalibrationRun) -> ReportMaterial:
         sheets=rejection_sheets(run, chosen.rejected),
         working_point=working_point_picture(run),
         residuals=residual_figures(residual_evidence(run)),
+        edge_maps=edge_maps(run),
         scene=draw_scene(run),
     )
 

@@ -109,6 +109,8 @@ def render_report(
         rejected=rejected,
         legend=_legend(shown, [pictures for _, pictures in rejected]),
         residuals=material.residuals,
+        edge_maps=material.edge_maps,
+        picture_rows=details.picture_rows(result),
         residual_sizes=details.residual_sizes(result),
         groups=details.groups(result),
         tests=details.residual_tests(result),

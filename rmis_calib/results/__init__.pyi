@@ -8,6 +8,8 @@ from .parts import InstrumentBase as InstrumentBase
 from .parts import KinematicOffsets as KinematicOffsets
 from .parts import Motions as Motions
 from .parts import Nuisance as Nuisance
+from .parts import PictureCheck as PictureCheck
+from .parts import PictureView as PictureView
 from .parts import Residual as Residual
 from .parts import ResidualTest as ResidualTest
 from .parts import Setup as Setup

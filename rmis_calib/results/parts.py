@@ -191,6 +191,53 @@ class Tests:
 
 
 @dataclass(frozen=True, eq=False, config=FILE_PART)
+class PictureView:
+    """Edges that the pictures of one camera show along the predicted contours of the shaft, from the picture's border
+    to the shaft's end; px of the undistorted picture."""
+
+    motions: int
+    """Number of motions whose pictures were looked at."""
+    stations: int
+    """Number of places along both contours, in all of them."""
+    edge_share: float
+    """Share of these places at which the picture shows an edge, from dark to light outwards, in line with the others of
+    its contour."""
+    median_px: Number
+    """Median distance of the edges from the predicted contours, px, positive outwards."""
+    spread_px: Number
+    """Robust standard deviation of it, px."""
+    right_px: Number
+    """Median over the motions of how far the shaft lies to the right of its prediction, px, for someone who looks
+    towards the tip."""
+    outward_px: Number
+    """Median over the motions of how far its contours lie outside of the predicted ones, px."""
+    along_right_px: Vector
+    """`right_px` in stretches of the shaft, from the border to its end, px."""
+    along_outward_px: Vector
+    """`outward_px` in the same stretches, px."""
+    bend_px: Vector
+    """What a straight line along the shaft leaves of `along_right_px`, motion by motion, px."""
+    lens_k1: Number
+    """Change of the lens's k1 that the bend of the contours asks for; null where they do not tell."""
+    lens_k1_sigma: Number
+    """1 sigma of it, from the scatter of the motions."""
+    by_place_right_px: tuple[Vector, ...]
+    """`right_px` in parts of the picture, px, rows from the top, columns from the left; null where no shaft is."""
+
+
+@dataclass(frozen=True, eq=False, config=FILE_PART)
+class PictureCheck:
+    """Whether the pictures show the shaft where the answer predicts it."""
+
+    passed: bool | None
+    """Whether nothing speaks against it; null where it was not looked at."""
+    sentences: tuple[str, ...]
+    """What speaks against it, or why it was not looked at."""
+    views: dict[str, PictureView]
+    """What was found, by camera (`right`, `left`)."""
+
+
+@dataclass(frozen=True, eq=False, config=FILE_PART)
 class Information:
     """What a recording tells of the transform and of the unknowns that recordings of one set-up share, for pooling."""
 

@@ -32,6 +32,7 @@ from rmis_calib.results.parts import (
     KinematicOffsets,
     Motions,
     Nuisance,
+    PictureCheck,
     Residual,
     Setup,
     Tests,
@@ -131,6 +132,9 @@ class CalibrationResult:
     absent elsewhere."""
     information: Information | None = None
     """What pooling with other recordings needs beside the covariance; null for `paper` and `global`."""
+    picture: PictureCheck | None = None
+    """Whether the pictures show the shaft where the answer predicts it; absent without pictures (`solve`) and without
+    an answer."""
     created: str = field(default_factory=_now)
     """When the result was made, ISO 8601, UTC."""
 
@@ -197,7 +201,7 @@ class CalibrationResult:
     def to_dict(self) -> dict[str, Any]:
         """The result as plain JSON values, every number finite or None; the answer first."""
         record = record_type().dump_python(self, mode="json", by_alias=True)
-        for name in ("setup", "instrument_base", "tests"):  # as in results of before
+        for name in ("setup", "instrument_base", "tests", "picture"):  # as in results of before
             if record[name] is None:
                 del record[name]
         return {key: record[key] for key in (*_ANSWER, *record)}

@@ -17,8 +17,8 @@ from rmis_calib.errors import InputError
 from rmis_calib.geometry.rigid import rigid_inverse, transform_points
 from rmis_calib.geometry.rotations import matrix_to_quat
 from rmis_calib.io import Recording, load_recording
+from rmis_calib.pipeline.answer.predicted_shaft import in_picture, shaft_edges
 from rmis_calib.pipeline.scene import PlacedCameras, Scene, advised_scene, place_cameras, scene_of
-from rmis_calib.report.drawing.predicted import in_picture, shaft_edges
 from rmis_calib.results import CalibrationResult
 from rmis_calib.vision import draw_polyline
 

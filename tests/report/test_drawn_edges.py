@@ -4,8 +4,8 @@ import numpy as np
 import torch
 
 from rmis_calib.geometry.cameras import Camera
+from rmis_calib.pipeline.answer.predicted_shaft import in_picture, shaft_edges
 from rmis_calib.report.drawing.frames import shortened
-from rmis_calib.report.drawing.predicted import in_picture, shaft_edges
 
 
 def test_edges_run_from_the_rcm_to_the_end_of_the_shaft():

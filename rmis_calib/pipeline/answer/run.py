@@ -2,11 +2,13 @@
 
 from dataclasses import dataclass, replace
 
-from jaxtyping import Float
+import numpy as np
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from rmis_calib.geometry.cameras import Camera
 from rmis_calib.io import Recording, ShaftObservations
+from rmis_calib.pipeline.answer.view_edges import ViewEdges
 from rmis_calib.pipeline.arms.poses import MotionPoses, predict_contours, predict_ends
 from rmis_calib.pipeline.motions.association import Choice
 from rmis_calib.pipeline.pictures.detection import View
@@ -27,6 +29,7 @@ class CalibrationRun:
         choices: candidate taken in each view.
         observations: what the solver saw.
         solution: what the solver returned; None when there were too few motions to solve.
+        picture_edges: what the pictures show along the predicted contours, by view; empty where nothing was looked at.
     """
 
     result: CalibrationResult
@@ -37,6 +40,7 @@ class CalibrationRun:
     choices: tuple[Choice, ...]
     observations: ShaftObservations | None
     solution: Solution | None
+    picture_edges: tuple[ViewEdges, ...] = ()
 
     def with_notes(self, notes: tuple[str, ...]) -> "CalibrationRun":
         """The run with notes on what was read, before what is noted already."""
@@ -47,6 +51,14 @@ class CalibrationRun:
         """Clock that was found, offset (s) and rate; None where it is no unknown or the data cannot tell it."""
         clock = None if self.solution is None else self.solution.nuisances.get("clock")
         return None if clock is None or bool(clock.held) else self.result.kinematic_offsets.clock
+
+    @property
+    def groups(self) -> Int[np.ndarray, " m"]:
+        """Number of each motion's group of neighbours (`result.consistency`); -1 where there is none."""
+        consistency = self.result.consistency
+        if consistency is None or len(consistency.group_by_motion) != len(self.poses.frames):
+            return np.full(len(self.poses.frames), -1)
+        return np.asarray(consistency.group_by_motion, dtype=int)
 
     def camera(self, view: View) -> Camera | None:
         """A view's camera, corrected by what was found to be off in it."""

@@ -73,7 +73,7 @@ def _figure(residual: SignedResiduals, evidence: ResidualEvidence) -> ResidualFi
     largest = float(np.abs(counted).max())
     limit = (min(1.05 * largest, _SCALES_SHOWN * scale) if scale > 0.0 else 1.05 * largest) or 1.0
     shown = residual.at(drawn_points(residual.px))
-    enlarged = _rounded(_STICK * evidence.picture_size[1] / max(scale, 1e-9))
+    enlarged = rounded_factor(_STICK * evidence.picture_size[1] / max(scale, 1e-9))
     title, meaning = KINDS[residual.kind]
     times_s = evidence.times_s[shown.motion]
     by_time = bool(np.isfinite(times_s).all()) and len(shown.px) > 1 and float(np.ptp(times_s)) > 0.0
@@ -104,7 +104,7 @@ def _figure(residual: SignedResiduals, evidence: ResidualEvidence) -> ResidualFi
     )
 
 
-def _rounded(factor: float) -> float:
+def rounded_factor(factor: float) -> float:
     """The next smaller of 1, 2, 5, 10, 20, ... or, below 1, of 0.5, 0.2, 0.1, ..."""
     power = 10.0 ** np.floor(np.log10(max(factor, 1e-6)))
     return float(max(step for step in (1.0, 2.0, 5.0) if step * power <= factor * (1 + 1e-9)) * power)

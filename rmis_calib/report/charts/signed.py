@@ -13,11 +13,11 @@ from torch import Tensor
 
 from rmis_calib.geometry.cameras import Camera, corrected_point
 from rmis_calib.geometry.lines import contour_planes, point_line_distance
+from rmis_calib.pipeline.answer.predicted_shaft import PredictedShaft, in_picture, predict_shaft
 from rmis_calib.pipeline.answer.run import CalibrationRun
 from rmis_calib.pipeline.motions.association import reversed_direction
 from rmis_calib.pipeline.pictures.detection import View
 from rmis_calib.pipeline.scene import readings_of
-from rmis_calib.report.drawing.predicted import PredictedShaft, in_picture, predict_shaft
 
 KINDS = {
     "across": (
@@ -84,7 +84,7 @@ def residual_evidence(run: CalibrationRun) -> ResidualEvidence | None:
     if run.result.camera_right_T_arm is None:
         return None
     by_kind: dict[str, list[dict[str, np.ndarray]]] = {}
-    group = motion_groups(run)
+    group = run.groups
     for view in run.views:
         motions = np.arange(len(run.poses.frames))
         predicted, camera = predict_shaft(run, view, motions), run.camera(view)
@@ -122,14 +122,6 @@ def _counted(run: CalibrationRun, kind: str, side: str) -> Bool[np.ndarray, " m"
     used = run.result.motions.used[run.poses.frames]
     entry = run.result.residuals.get(f"end_{side}") if kind == "end" else None
     return used if entry is None else used & np.isfinite(entry.by_motion[run.poses.frames])
-
-
-def motion_groups(run: CalibrationRun) -> Int[np.ndarray, " m"]:
-    """Number of each motion's group of neighbours; -1 where there is none."""
-    consistency = run.result.consistency
-    if consistency is None or len(consistency.group_by_motion) != len(run.poses.frames):
-        return np.full(len(run.poses.frames), -1)
-    return np.asarray(consistency.group_by_motion, dtype=int)
 
 
 def _moving_joints(run: CalibrationRun) -> dict[str, Float[np.ndarray, " f"]]:

@@ -8,13 +8,13 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from rmis_calib.geometry.cameras import Camera
+from rmis_calib.pipeline.answer.predicted_shaft import PredictedShaft, in_picture, inside, predict_shaft
 from rmis_calib.pipeline.answer.result import TOO_FEW
 from rmis_calib.pipeline.answer.run import CalibrationRun
 from rmis_calib.pipeline.pictures.detection import View
 from rmis_calib.pipeline.scene import scene_of
 from rmis_calib.report.drawing.marks import Mark
 from rmis_calib.report.drawing.overlays import Overlay
-from rmis_calib.report.drawing.predicted import PredictedShaft, in_picture, inside, predict_shaft
 from rmis_calib.results import CalibrationResult
 
 _AT_ONCE = 16

@@ -8,12 +8,12 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from rmis_calib.config import CalibrationConfig, parse_config
+from rmis_calib.pipeline.answer.predicted_shaft import predict_shaft
 from rmis_calib.pipeline.answer.run import CalibrationRun
 from rmis_calib.pipeline.pictures.detection import View
 from rmis_calib.report.drawing.frames import detected_marks, overlay_of, predicted_marks
 from rmis_calib.report.drawing.marks import Mark
 from rmis_calib.report.drawing.overlays import Overlay
-from rmis_calib.report.drawing.predicted import predict_shaft
 from rmis_calib.vision import ShaftDetector, strip_edges
 
 

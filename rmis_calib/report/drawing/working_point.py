@@ -9,13 +9,13 @@ import torch
 from jaxtyping import Float, UInt8
 
 from rmis_calib.geometry.cameras import Camera
+from rmis_calib.pipeline.answer.predicted_shaft import PredictedShaft, in_picture, inside, predict_shaft
 from rmis_calib.pipeline.answer.run import CalibrationRun
 from rmis_calib.pipeline.scene import point_covariance
 from rmis_calib.report.drawing.choosing import largest_residual
 from rmis_calib.report.drawing.frames import overlays
 from rmis_calib.report.drawing.marks import Mark
 from rmis_calib.report.drawing.overlays import Overlay
-from rmis_calib.report.drawing.predicted import PredictedShaft, in_picture, inside, predict_shaft
 
 _SHOWN_MM, _SHOWN_PART = 34.0, 0.3
 """Width of the cut-out at least, mm and part of the frame: the tip of an instrument and what is about it."""

@@ -91,6 +91,21 @@ class TestTable:
     count: int
 
 
+@dataclass(frozen=True)
+class PictureRow:
+    """What the pictures of one camera show along the predicted contours, px."""
+
+    camera: str
+    motions: int
+    share: str
+    median_px: str
+    spread_px: str
+    right_px: str
+    outward_px: str
+    along_right_px: tuple[str, ...]
+    along_outward_px: tuple[str, ...]
+
+
 def unknowns(result: CalibrationResult) -> tuple[Row, ...]:
     """Everything else that was estimated or assumed, with its sigma."""
     rows = []
@@ -184,6 +199,30 @@ def head_point_errors(result: CalibrationResult) -> tuple[tuple[str, ...], ...]:
         (camera, *(significant(distance) for distance in (error.median, error.rms, error.max)), str(error.count))
         for camera, error in errors.items()
     )
+
+
+def picture_rows(result: CalibrationResult) -> tuple[PictureRow, ...]:
+    """What the pictures show along the predicted contours, a row a camera."""
+    if result.picture is None:
+        return ()
+    return tuple(
+        PictureRow(
+            camera=camera,
+            motions=view.motions,
+            share=f"{100.0 * view.edge_share:.0f} %",
+            median_px=significant(view.median_px, 2),
+            spread_px=significant(view.spread_px, 2),
+            right_px=significant(view.right_px, 2),
+            outward_px=significant(view.outward_px, 2),
+            along_right_px=tuple(_pixels(px) for px in view.along_right_px.tolist()),
+            along_outward_px=tuple(_pixels(px) for px in view.along_outward_px.tolist()),
+        )
+        for camera, view in result.picture.views.items()
+    )
+
+
+def _pixels(px: float) -> str:
+    return f"{px:+.2f}".replace("-", "−") if np.isfinite(px) else ""
 
 
 def created(result: CalibrationResult) -> str:

@@ -77,7 +77,7 @@ def verdict(result: CalibrationResult) -> Verdict:
 
 def checks(result: CalibrationResult, reason: str) -> tuple[Check, ...]:
     """What the verdict rests on. Where all of these hold and the result is still not trustworthy, the reason is one."""
-    found = [*_error_checks(result), *_residual_checks(result)]
+    found = [*_error_checks(result), *_residual_checks(result), *_picture_checks(result)]
     if result.status in ("insufficient_data", "solver_failed") or not found:
         return ()
     if not result.trustworthy and all(check.passed for check in found):
@@ -116,6 +116,18 @@ def _residual_checks(result: CalibrationResult) -> list[Check]:
 
 def _sigmas(test: ResidualTest) -> str:
     return f"{significant(test.statistic, 2)} sigmas"
+
+
+def _picture_checks(result: CalibrationResult) -> list[Check]:
+    """Whether the pictures show the shaft where it is predicted."""
+    picture = result.picture
+    if picture is None or picture.passed is None:
+        return []
+    found = [
+        f"an edge at {100.0 * view.edge_share:.0f} %, {significant(view.median_px, 2)} px off ({camera})"
+        for camera, view in picture.views.items()
+    ]
+    return [Check(picture.passed, f"Pictures along the predicted contours: {'; '.join(found)}")]
 
 
 def next_steps(result: CalibrationResult) -> tuple[tuple[str, ...], tuple[str, ...]]:

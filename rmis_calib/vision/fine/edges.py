@@ -107,7 +107,7 @@ def _project(colours: Float[Tensor, "3 b k 2 p d"], use: Bool[Tensor, "b k 2 p"]
     return red + green + blue
 
 
-def _steepest(profile: Float[Tensor, "b k 2 p d"]) -> tuple[Float[Tensor, "b k 2 p"], Float[Tensor, "b k 2 p"]]:
+def steepest(profile: Float[Tensor, "*b d"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]:
     """Place of the steepest rise, in profile steps from the middle, and the rise of a smoothed profile there."""
     size = profile.shape[-1]
     near, wide = profile[..., 3:-1] - profile[..., 1:-3], profile[..., 4:] - profile[..., :-4]
@@ -133,7 +133,7 @@ def rough(
     colours, seen = _read_bands(picture, strips, t, lateral, offsets)
     seen &= use
     profile = _project(colours, seen)
-    place, slope = _steepest(profile)
+    place, slope = steepest(profile)
     height = profile[..., -4:].mean(-1) - profile[..., :4].mean(-1)
     outward = t.new_tensor([1.0, -1.0])[:, None]
     blur = masked_median((height / slope.clamp(min=1e-4) / 2.5066).clamp(0.4, 6.0), seen) * step_px

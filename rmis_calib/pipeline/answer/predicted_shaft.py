@@ -14,7 +14,7 @@ from rmis_calib.pipeline.answer.run import CalibrationRun
 from rmis_calib.pipeline.pictures.detection import View
 
 _SAMPLES = 200
-_LEAST_DEPTH_MM = 1.0
+LEAST_DEPTH_MM = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ def shaft_edges(
 def in_picture(camera: Camera, camera_p_x: Float[Tensor, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
     """Raw pixels of points; NaN where a point is behind the camera or beyond the reach of the lens model."""
     uv, valid = camera.project(camera_p_x)
-    valid = valid & (camera_p_x[..., 2] > _LEAST_DEPTH_MM)
+    valid = valid & (camera_p_x[..., 2] > LEAST_DEPTH_MM)
     return torch.where(valid[..., None], uv, torch.nan).numpy()
 
 
