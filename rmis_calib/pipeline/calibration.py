@@ -12,7 +12,7 @@ from rmis_calib.geometry.rigid import RigidTransform
 from rmis_calib.io import Recording, ShaftObservations
 from rmis_calib.pipeline.answer.advice import with_next_motions
 from rmis_calib.pipeline.answer.estimation import estimate, raise_unless_trustworthy
-from rmis_calib.pipeline.answer.guided_look import about_looks, look_along
+from rmis_calib.pipeline.answer.guided_look import about_looks, expected_contours, look_along
 from rmis_calib.pipeline.answer.motion_names import MotionNames
 from rmis_calib.pipeline.answer.offsets import estimate_with_kinematics
 from rmis_calib.pipeline.answer.result import insufficient_data, make_result, motions_of, residual_of, residuals_px
@@ -239,7 +239,7 @@ def better_choices(run: CalibrationRun, several: bool) -> tuple[Choice, ...] | N
     used = torch.as_tensor(run.result.motions.used[run.poses.frames], device=run.poses.arm_T_rcm.device)
     better = []
     for view, choice in zip(run.views, run.choices, strict=True):
-        prediction = run.predicted_contours(view)
+        prediction = expected_contours(run, view)
         if prediction is None:
             return None
         found = view.at(run.poses.frames)

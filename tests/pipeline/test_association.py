@@ -12,7 +12,7 @@ import rmis_calib as rc
 from rmis_calib.config import parse_config
 from rmis_calib.errors import InputError
 from rmis_calib.geometry.lines import contour_planes
-from rmis_calib.pipeline.answer.guided_look import about_looks, look_along
+from rmis_calib.pipeline.answer.guided_look import about_looks, expected_contours, look_along
 from rmis_calib.pipeline.arms.poses import motion_poses
 from rmis_calib.pipeline.calibration import better_choices, run_calibration
 from rmis_calib.pipeline.motions.association import (
@@ -204,6 +204,21 @@ def test_the_instrument_that_moves_with_the_joints_is_the_one_that_calibrates(tm
     check_what_is_known_beforehand(recording, run, config, folder)
     check_an_answer_that_is_open_still_chooses(run)
     check_a_look_along_the_prediction(run, config)
+    check_contours_are_expected_where_the_given_camera_sees_them(run)
+
+
+def check_contours_are_expected_where_the_given_camera_sees_them(run):
+    """An answer whose principal point is off by 0.02 focal lengths shifts every point by that."""
+    view, shift = run.views[0], 0.02
+    camera = view.camera.to(torch.float64)
+    view = replace(view, camera=replace(camera, distortion=torch.zeros_like(camera.distortion)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(type(run.result), "intrinsic_correction", lambda self, side: (0.0, shift, 0.0, 0.0))
+        expected, predicted = expected_contours(run, view), run.predicted_contours(view)
+    # a x + b y + c = 0 with x + shift in the place of x.
+    by_hand = predicted + torch.tensor([0.0, 0.0, shift]) * predicted[..., :1]
+    by_hand, expected = (line / line[..., :2].norm(dim=-1, keepdim=True) for line in (by_hand, expected))
+    assert torch.allclose(by_hand, expected, atol=1e-6)
 
 
 def check_a_look_along_the_prediction(run, config):

@@ -8,16 +8,19 @@ from torch import Tensor
 
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.geometry.cameras import Camera
+from rmis_calib.geometry.lines import line_through_points, point_line_distance
 from rmis_calib.geometry.rigid import rotate_vectors
 from rmis_calib.pipeline.answer.run import CalibrationRun
 from rmis_calib.pipeline.motions.association import distance_to
 from rmis_calib.pipeline.pictures.detection import Progress, View
 from rmis_calib.vision import FrameReason, ShaftDetections, ShaftDetector
 
-# Root mean square distance from the prediction, normalised units (1 mm at 100 mm), from which a candidate is another
-# thing: half of the shaft, its shadow, an instrument.
-_NEAR = 0.01
+# Root mean square distance from the prediction, normalised units (1 mm at 100 mm) and shares of its own width, from
+# which a candidate is another thing: half of the shaft, its shadow, an instrument.
+_NEAR, _NEAR_WIDTHS = 0.01, 0.15
 _SAMPLES, _STEP_MM = 24, 4.0
+_SPAN_MM = 30.0
+"""Between two points of a contour by which it is carried from one camera to the other."""
 
 
 def look_along(run: CalibrationRun, config: CalibrationConfig, progress: Progress) -> tuple[View, ...] | None:
@@ -28,14 +31,37 @@ def look_along(run: CalibrationRun, config: CalibrationConfig, progress: Progres
     """
     views, gained = [], 0
     for view in run.views:
-        expected = run.predicted_contours(view)
-        if expected is None or view.camera is None:
+        expected = expected_contours(run, view)
+        if expected is None:
             return None
         wanted = _in_view(run, view) & ~_has_near(view.at(run.poses.frames), expected)
         detections, found = _with_looks(view, run, expected, wanted, config, progress)
         views.append(replace(view, detections=detections))
         gained += found
     return tuple(views) if gained else None
+
+
+def expected_contours(run: CalibrationRun, view: View) -> Float[Tensor, "m 2 3"] | None:
+    """Contour planes where the answer puts the shaft, in the coordinates of the camera as it was given, in which shafts
+    are detected; as they are predicted where the shaft is behind it. None without an answer or a camera.
+
+    The answer goes with a camera that it corrected, by many pixels where the principal point is off: two points of each
+    contour are carried over by their pixels.
+    """
+    predicted, ends, camera_T_arm = run.predicted_contours(view), run.predicted_ends(view), run.camera_T_arm(view)
+    corrected = run.camera(view)
+    if predicted is None or ends is None or camera_T_arm is None or view.camera is None or corrected is None:
+        return None
+    found, given = (camera.to(dtype=ends.dtype, device=ends.device) for camera in (corrected, view.camera))
+    camera_v_axis = rotate_vectors(camera_T_arm @ run.poses.arm_T_rcm, run.poses.rcm_v_axis)
+    axis = torch.stack([ends - _SPAN_MM * camera_v_axis, ends], 1)[:, None]  # (m, 1, point, 3)
+    xy = axis[..., :2] / torch.where(axis[..., 2:] > 1.0, axis[..., 2:], torch.nan)
+    line = (predicted / predicted[..., :2].norm(dim=-1, keepdim=True))[:, :, None]  # (m, edge, 1, 3)
+    on_line = xy - point_line_distance(xy, line)[..., None] * line[..., :2]
+    moved, valid = given.undistort_points(found.pixels(on_line))
+    moved = torch.where(valid[..., None], moved, torch.nan)
+    carried = line_through_points(moved[..., 0, :], moved[..., 1, :])
+    return torch.where(torch.isfinite(carried).all(-1, keepdim=True), carried, predicted)
 
 
 def about_looks(before: tuple[View, ...], after: tuple[View, ...]) -> tuple[str, ...]:
@@ -53,7 +79,8 @@ def about_looks(before: tuple[View, ...], after: tuple[View, ...]) -> tuple[str,
 
 def _has_near(found: ShaftDetections, expected: Float[Tensor, "m 2 3"]) -> Bool[Tensor, " m"]:
     """Motions with a candidate where the shaft is expected."""
-    return (distance_to(found, expected) < _NEAR).any(-1)
+    width = (found.contour_xy[:, :, 0] - found.contour_xy[:, :, 1]).mean(2).norm(dim=-1)
+    return (distance_to(found, expected) < (_NEAR_WIDTHS * width).clamp(min=_NEAR)).any(-1)
 
 
 def _in_view(run: CalibrationRun, view: View) -> Bool[Tensor, " m"]:
@@ -81,7 +108,7 @@ def _with_looks(
     progress: Progress,
 ) -> tuple[ShaftDetections, int]:
     """The detections of all frames with those of the wanted motions, and of how many motions there are such."""
-    detector = ShaftDetector(config.detector, None if view.camera is None else run.camera(view))
+    detector = ShaftDetector(config.detector, view.camera)
     searched = view.detections.reason != FrameReason.LEFT_OUT
     motions = [m for m in wanted.nonzero()[:, 0].tolist() if searched[run.poses.frames[m]]]
     fields = {name: value.clone() for name, value in vars(view.detections).items()}
