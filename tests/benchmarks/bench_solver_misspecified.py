@@ -13,6 +13,7 @@ import argparse
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
@@ -23,8 +24,9 @@ from data_synth.lines import simulate_lines
 from data_synth.settings import LineStudyConfig
 from rmis_calib.config import parse_config
 from rmis_calib.geometry.rotations import matrix_to_rotvec, rotvec_to_matrix
-from rmis_calib.solver import Problem, Solution, solve
-from tests.benchmarks.bench_solver_nuisance import record
+from rmis_calib.solver import Problem, Solution, SolverSettings, solve
+from rmis_calib.solver.solution import concatenate
+from tests.benchmarks.bench_solver_nuisance import Recorded, record
 
 FOCAL_PX = 800.0
 POINTS = ("axis_right", "contour_right", "end_right", "axis_left", "contour_left", "end_left")
@@ -124,7 +126,7 @@ ERRORS: dict[str, Callable[[Arrays, np.random.Generator], Arrays]] = {
     "base 3 mm, 0.5 deg off": base_off,
     "bent shaft 1 mm": as_it_is,
 }
-SIMULATED: dict[str, dict[str, float]] = {"bent shaft 1 mm": {"shaft_sag_mm": 1.0}}
+SIMULATED: dict[str, dict[str, Any]] = {"bent shaft 1 mm": {"shaft_sag_mm": 1.0}}
 """Errors that the simulation itself makes."""
 
 
@@ -132,8 +134,8 @@ CLOCKS = ["clock right", "clock scale 1 %", "clock jumps 50 ms"]
 
 
 def scene(name: str, trials: int, motions: int, pixel_px: float, error: str = "right model") -> Arrays:
-    noise = {"pixel_noise_px": pixel_px, "kinematics_noise_mm": 0.3, "kinematics_noise_deg": 0.1}
-    stereo = {"stereo_noise_mm": 0.05, "stereo_noise_deg": 0.05, **SIMULATED.get(error, {})}
+    noise: dict[str, Any] = {"pixel_noise_px": pixel_px, "kinematics_noise_mm": 0.3, "kinematics_noise_deg": 0.1}
+    stereo: dict[str, Any] = {"stereo_noise_mm": 0.05, "stereo_noise_deg": 0.05, **SIMULATED.get(error, {})}
     arrays = simulate_lines(
         LineStudyConfig(trials=trials, motion="random", random_motions=motions, seed=4, **noise, **stereo)
     )
@@ -185,18 +187,26 @@ def clocks(what: str, trials: int, modes: list[str]) -> None:
     """Recordings of 19 s at 10 Hz whose clocks are wrong; `before` takes the clock for one constant offset."""
     n, at = 192, np.arange(192)
     wrong = {"clock right": (0.0, 0.0), "clock scale 1 %": (0.0, 0.01), "clock jumps 50 ms": (0.05 * (at >= 110), 0.0)}
-    recorded, truth = record(trials, n, 4, stereo=(0.05, 0.05), clock_s=wrong[what][0], rate=wrong[what][1])
-
-    def kinematics(joints: torch.Tensor, clock: torch.Tensor, *_: torch.Tensor) -> Problem:
-        return recorded.kinematics(joints, clock).only("axis", "contours", "ends")
-
+    clock_s, rate = wrong[what]
+    recorded = [record(1, n, 4 + trial, stereo=(0.05, 0.05), clock_s=clock_s, rate=rate) for trial in range(trials)]
+    truth = torch.cat([X for _, X in recorded])
     for mode, groups, rate in (("before", 0, "never"), ("evidence", 8, "auto")):
         if mode not in modes:
             continue
         unknowns = {"joint_offsets": "never", "clock_rate": rate}
         settings = parse_config({"solver": {"groups": groups, "unknowns": unknowns}}).solver
-        start = kinematics(*(torch.zeros(trials, width, dtype=torch.float64) for width in (6, 2)))
-        row("moving", what, mode, solve(start, settings, kinematics=kinematics), truth)
+        row("moving", what, mode, concatenate([of_one(recording, settings) for recording, _ in recorded]), truth)
+
+
+def of_one(recorded: Recorded, settings: SolverSettings) -> Solution:
+    """The solution of one recording, whose kinematics are a function of the clock (not of a batch: trials of which the
+    data ask for different unknowns are solved apart)."""
+
+    def kinematics(joints: torch.Tensor, clock: torch.Tensor, *_: torch.Tensor) -> Problem:
+        return recorded.kinematics(joints, clock).only("axis", "contours", "ends")
+
+    start = kinematics(*(torch.zeros(1, width, dtype=torch.float64) for width in (6, 2)))
+    return solve(start, settings, kinematics=kinematics)
 
 
 def row(name: str, what: str, mode: str, found: Solution, truth: torch.Tensor) -> None:
