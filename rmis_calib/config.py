@@ -41,6 +41,9 @@ class PictureErrors:
     """The same of the principal points, px per axis."""
     lens_sigma: NotNegative = 0.03
     """The same of the radial distortion k1."""
+    readout_sigma_s: NotNegative = 0.01
+    """Time from reading the first row to reading the last, 1 sigma about zero, where recording.yaml does not tell it
+    (`rolling_shutter_s`): estimated where the data ask for it, else allowed for. 0: all rows are read at once."""
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid", allow_inf_nan=False))

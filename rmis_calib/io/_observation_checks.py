@@ -29,7 +29,16 @@ _END_KINDS = (0, 1)
 _LEVELS = tuple(f"sigma_{what}_{unit}" for what in ("kinematics", "camera", "stereo") for unit in ("mm", "rad"))
 _INTRINSICS = ("sigma_focal", "sigma_centre", "sigma_lens")
 _SETUP = ("sigma_setup_mm", "sigma_setup_rad")
-_SCALARS = ("shaft_radius_mm", "sigma_image", "sigma_edge_bias", *_INTRINSICS, *_LEVELS, *_SETUP, "sigma_rcm_mm")
+_SCALARS = (
+    "shaft_radius_mm",
+    "sigma_image",
+    "sigma_edge_bias",
+    *_INTRINSICS,
+    *_LEVELS,
+    *_SETUP,
+    "sigma_rcm_mm",
+    "sigma_readout",
+)
 _NEEDS = {"contour": "shaft_radius_mm", "end": "rcm_s_end_mm", "head": "rcm_p_head"}
 # Rounding of single precision stays below; a direction that was never normalised does not.
 _UNIT_TOLERANCE = 1e-6

@@ -101,6 +101,9 @@ class ShaftObservations:
     sigma_edge_bias: float | None = None
     """Of an error that all pictures of a camera share: each contour point is off across its line by the same amount in
     every motion (lens model, edge detector), normalised units. It does not average out."""
+    sigma_readout: float | None = None
+    """Of the time from reading a row of the picture to reading the one that is a focal length farther down, s; None or
+    0: all rows are read at once."""
     sigma_focal: float | None = None
     """Of each camera's focal length, relative."""
     sigma_centre: float | None = None

@@ -36,6 +36,7 @@ class NoiseLevels:
         camera_rad: its orientation.
         stereo_mm: per axis, of `camera_left_T_camera_right`, drawn once.
         stereo_rad: its orientation.
+        readout: of the time from reading a row to reading the one a focal length farther down, s.
         edge_bias: of a shift across the line that a contour point has in every motion alike, normalised units.
         focal: of each camera's focal length, relative.
         centre: of its principal point, per axis, in focal lengths.
@@ -52,6 +53,7 @@ class NoiseLevels:
     camera_rad: Float[Tensor, "*batch"]
     stereo_mm: Float[Tensor, "*batch"]
     stereo_rad: Float[Tensor, "*batch"]
+    readout: Float[Tensor, "*batch"]
     edge_bias: Float[Tensor, "*batch"]
     focal: Float[Tensor, "*batch"]
     centre: Float[Tensor, "*batch"]
@@ -61,7 +63,7 @@ class NoiseLevels:
     rcm_mm: Float[Tensor, "*batch"]
 
 
-_NONE_UNLESS_NAMED = ("camera_mm", "camera_rad", "edge_bias", "focal", "centre", "lens")
+_NONE_UNLESS_NAMED = ("camera_mm", "camera_rad", "readout", "edge_bias", "focal", "centre", "lens")
 """Levels that are zero where the observations do not name them."""
 
 

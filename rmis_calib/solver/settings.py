@@ -73,6 +73,10 @@ class UnknownSettings:
     wrong), beside the offset; `auto`: where the data ask for it."""
     clock_rate_sigma: NotNegative = 0.02
     """Prior of that rate about zero: 29.97 for 30 frames a second is 0.001, 24 for 25 is 0.04."""
+    readout: Literal["never", "auto", "always"] = "auto"
+    """Estimate how long the camera takes from row to row (rows read one after the other see a moving shaft at different
+    instants), where the velocities are in the problem and the observations name its prior (`sigma_readout`); `auto`:
+    where the data ask for it."""
     edge_bias: bool = True
     """Estimate the shift across its line that each line point has in every motion alike (an error of the lens model or
     of the edge detector does not average out), where the observations name its prior (`sigma_edge_bias`)."""

@@ -47,6 +47,7 @@ def everything() -> dict[str, Any]:
         "sigma_setup_mm": 50.0,
         "sigma_setup_rad": 0.09,
         "sigma_rcm_mm": 0.5,
+        "sigma_readout": 0.01,
         "unknown_names": np.array(["laparoscope.yaw_rad", "instrument.insertion_mm", "clock_s"]),
         "unknown_displacement": generator.normal(size=(N, 3, 6)),
         "unknown_at": np.array([0.001, 0.1, 0.02]),

@@ -70,9 +70,21 @@ def test_the_answer_is_that_of_the_shaft_and_evaluate_says_the_same(rolling) -> 
     found = rc.evaluate(result, folder)
     assert found.head_point_error_px is not None and result.head_point_error_px is not None
     assert found.head_point_error_px["right"].median == pytest.approx(result.head_point_error_px["right"].median)
-    ignored = rc.calibrate(replace(recording, rolling_shutter_s=0.0), QUICK, throw=False)
+    at_once = replace(QUICK, picture_errors=replace(QUICK.picture_errors, readout_sigma_s=0.0))
+    ignored = rc.calibrate(replace(recording, rolling_shutter_s=0.0), at_once, throw=False)
     worse = rc.evaluate(ignored, folder)
     assert found.translation_error_mm is not None and worse.translation_error_mm is not None
     assert found.translation_error_mm < 0.4 * worse.translation_error_mm
     assert worse.head_point_error_px is not None
     assert found.head_point_error_px["right"].median < 0.4 * worse.head_point_error_px["right"].median
+
+
+def test_rows_that_nobody_tells_of_are_found_in_the_data(rolling) -> None:
+    """The generator reads 480 rows in 20 ms, one focal length (700 px) in 29 ms."""
+    folder, recording, _ = rolling
+    result = rc.calibrate(replace(recording, rolling_shutter_s=0.0), QUICK, throw=False)
+    focal_rows = float(recording.stereo.right.focal) / recording.right.size[0]
+    found = result.nuisances["readout"]
+    assert found.sigma is not None and abs(found.value - READOUT_S * focal_rows) < 4.0 * found.sigma < 0.01
+    measured = rc.evaluate(result, folder)
+    assert measured.error_sigmas is not None and measured.error_sigmas < 4.49

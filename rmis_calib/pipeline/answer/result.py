@@ -53,7 +53,7 @@ CORRECTED = 1.0
 """Correction of a camera in prior sigmas from which it is said."""
 WORTH_SAYING = 1.25
 """Growth of sigma by disagreeing groups from which it is said."""
-OF_ONE_RECORDING = ("clock", "clock_rate", "joint_offset", "rcm_offset", "setup")
+OF_ONE_RECORDING = ("clock", "clock_rate", "readout", "joint_offset", "rcm_offset", "setup")
 """Unknowns that another recording of the same set-up need not share."""
 TOO_FAR_SIGMA = 4.0
 """An unknown estimated this many prior sigmas from its nominal value says that the model does not fit the data."""

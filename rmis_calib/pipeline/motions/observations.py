@@ -53,10 +53,19 @@ def assemble(
         sigma_focal=errors.focal_sigma_relative,
         sigma_centre=errors.centre_sigma_px / focal,
         sigma_lens=errors.lens_sigma,
+        sigma_readout=_readout_sigma(recording, config),
         sigma_rcm_mm=recording.robot.rcm_sigma_mm,
         **head_observations(recording, poses),
         **arrays,
     )
+
+
+def _readout_sigma(recording: Recording, config: CalibrationConfig) -> float:
+    """As `sigma_readout`; 0 where the recording tells how long its rows take, whose points are then put to one
+    instant."""
+    told = bool(recording.rolling_shutter_s)
+    focal_rows = float(recording.stereo.right.focal) / recording.right.size[0]
+    return 0.0 if told else config.picture_errors.readout_sigma_s * focal_rows
 
 
 def problem_of(observations: ShaftObservations, config: CalibrationConfig) -> Problem:

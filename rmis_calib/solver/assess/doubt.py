@@ -22,10 +22,10 @@ CENTRE_DOUBT = 0.8
 of each) and a still laparoscope are within the 95 % ellipsoid, with this 92 %."""
 
 
-RCM_DOUBT = 0.5
-"""Probability, before the data speak, that the shaft misses the RCM by about its prior: more than for a set-up that
-somebody measured. With 0.2, 5 % of trials with a still laparoscope and an RCM missed by 1 mm are called trustworthy and
-wrong, with this none."""
+OWN_BELIEF = {"rcm_offset": 0.5, "readout": 0.5}
+"""Least probability, before the data speak, that the shaft misses the RCM, and that rows are read one after the other,
+by about the prior: more than that a set-up is wrong which somebody measured. With 0.2 for the RCM, 5 % of trials with a
+still laparoscope and an RCM missed by 1 mm are called trustworthy and wrong, with this none."""
 COVERED = 0.95
 """Part of all cases that the ellipsoid of this size is to hold, whether an unknown is nominal or not."""
 
@@ -33,7 +33,7 @@ COVERED = 0.95
 def belief_in(name: str, asked: UnknownSettings) -> float:
     """Probability, before the data speak, that an unknown is off by about how far it may be; 0: everything is
     trusted."""
-    return max(asked.doubt, RCM_DOUBT) if name == "rcm_offset" and asked.doubt else asked.doubt
+    return max(asked.doubt, OWN_BELIEF.get(name, 0.0)) if asked.doubt else 0.0
 
 
 def considered(

@@ -31,7 +31,7 @@ from rmis_calib.solver.model.normal_equations import WeightedModel, membership
 from rmis_calib.solver.model.state import State
 from rmis_calib.solver.settings import SolverSettings
 
-CHANCE = {"clock_rate": 0.005, "setup": 0.02, "rcm_offset": 0.02, "compliance": 1e-4}
+CHANCE = {"clock_rate": 0.005, "readout": 0.005, "setup": 0.02, "rcm_offset": 0.02, "compliance": 1e-4}
 """Probability, with everything nominal, from which an unknown is freed: less for what costs more."""
 SEEN = 2.0
 """Information on a direction, in that of the prior, from which it counts."""
@@ -53,13 +53,14 @@ class Evidence:
 
 def weigh(fit: MapEstimate, settings: SolverSettings) -> Evidence:
     """Evidence on the unknowns that are left out and may be estimated (`clock_rate`; `setup`, where the laparoscope's
-    own kinematics are told; `rcm_offset`; `compliance`), doubt of the latter three, and of the cameras' principal
-    points, which may all be off alike (`centre`)."""
+    own kinematics are told; `rcm_offset`; `compliance`; `readout`), doubt of all but the first, and of the cameras'
+    principal points, which may all be off alike (`centre`)."""
     asked, chance, doubt = settings.unknowns, {}, {}
     if "intrinsics" in fit.model.layout.blocks and asked.doubt > 0.0:
         doubt["centre"] = doubt_of_centres(fit)
     left_out = {
         "clock_rate": asked.clock_rate == "auto" and "clock" in fit.model.layout.blocks,
+        "readout": asked.readout == "auto" and _may_be_read_later(fit),
         "setup": asked.setup == "known" and fit.problem.laparoscope_base_T_arm is not None,
         "rcm_offset": asked.rcm_offset == "auto",
         "compliance": asked.compliance == "auto",
@@ -74,7 +75,8 @@ def weigh(fit: MapEstimate, settings: SolverSettings) -> Evidence:
         if name == "clock_rate":
             continue
         # A camera that stands still cannot tell a bend of the shaft from an error of the picture, nor see the set-up.
-        chance[name] = torch.where(candidates.still, 1.0, tail)
+        if name != "readout":
+            chance[name] = torch.where(candidates.still, 1.0, tail)
         if name == "setup":
             seen = (~candidates.still).to(block.A.dtype)
             block = replace(block, A=block.A * seen[:, None, None], u=block.u * seen[:, None])
@@ -82,6 +84,10 @@ def weigh(fit: MapEstimate, settings: SolverSettings) -> Evidence:
         size = considered(candidates.nominal, asked, name, sigma)
         doubt[name] = doubt_of(block, sigma, size, inflation, belief_in(name, asked))
     return Evidence(chance, doubt)
+
+
+def _may_be_read_later(fit: MapEstimate) -> bool:
+    return fit.model.measured.clock is not None and bool((fit.problem.noise.readout > 0).any())
 
 
 def _tested(candidates: Candidates, name: str) -> tuple[Freed, Float[Tensor, " b"], Float[Tensor, " b"]]:

@@ -176,6 +176,13 @@ class MeasurementRows:
         own = [rows.among(self.cameras, rows.var) for rows in self.own]
         return torch.cat((self.line_var.flatten(0, 1), self.end_var, heads, *own))
 
+    @cached_property
+    def rows_y(self) -> Float[Tensor, "k b n"]:
+        """How far down in the picture each row was measured, in focal lengths; 0 for the user's own."""
+        heads = self.head_xy[1].repeat(2, 1, 1) if self.has_heads else self.head_ok.to(self.p.dtype)
+        own = [rows.among(self.cameras, torch.zeros_like(rows.var)) for rows in self.own]
+        return torch.cat((self.line_xy[1].flatten(0, 1), self.end_xy[1], heads, *own))
+
     def narrow(self, trials: slice, motions: slice) -> "MeasurementRows":
         """The part of these trials and motions."""
         if trials.indices(self.trials) == (0, self.trials, 1) and motions.indices(self.motions) == (0, self.motions, 1):

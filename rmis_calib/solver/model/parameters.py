@@ -14,7 +14,7 @@ from rmis_calib.solver.model.compliance import COUNT, FUNCTIONS, PRIORS, SHIFTS,
 from rmis_calib.solver.model.linearised_rows import LinearisedRows
 from rmis_calib.solver.model.measurement_rows import LINE, MeasurementRows, line_points
 from rmis_calib.solver.model.predicted_shaft import Shaft, rcm_axes
-from rmis_calib.solver.model.residuals import intrinsic_effects
+from rmis_calib.solver.model.residuals import displaced_rows, intrinsic_effects, read_later
 from rmis_calib.solver.model.state import State
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import NoiseSettings, UnknownSettings
@@ -30,6 +30,7 @@ UNITS = {
     "joint_offset": "rad or mm",
     "clock": "s",
     "clock_rate": "relative",
+    "readout": "s a focal length",
     "edge_bias": "focal lengths",
     "intrinsics": "relative, focal lengths, k1",
     "setup": "rad, mm",
@@ -105,6 +106,7 @@ class ParameterLayout:
             "joint_offset": state.joint_offset - origin.joint_offset,
             "clock": (state.clock - origin.clock)[:, :1],
             "clock_rate": (state.clock - origin.clock)[:, 1:],
+            "readout": (state.readout - origin.readout)[:, None],
             "edge_bias": (state.edge_bias - origin.edge_bias).flatten(1),
             "intrinsics": (state.intrinsics - origin.intrinsics).flatten(1),
             "setup": state.setup - origin.setup,
@@ -124,6 +126,7 @@ class NuisancePriors:
         stereo_mm, stereo_rad: given noise of the stereo extrinsics; NaN where unknown.
         joint_offset_sigma: prior of each joint offset (no joints: none can be estimated).
         joint_offset_at, clock_at: where the kinematics were evaluated.
+        readout: prior of the time from row to row; 0 where there is none.
         edge_bias: prior of the shift of each line row; 0 where there is none.
         intrinsics: prior of each camera's corrections; 0 where there is none.
         setup_at: where the kinematics were evaluated, from the stated set-up (from none: the identity); as
@@ -139,6 +142,7 @@ class NuisancePriors:
     joint_offset_sigma: Float[Tensor, "b j"]
     joint_offset_at: Float[Tensor, "b j"]
     clock_at: Float[Tensor, "b 2"]
+    readout: Float[Tensor, " b"]
     edge_bias: Float[Tensor, "b l c"]
     intrinsics: Float[Tensor, "b c 4"]
     setup_at: Float[Tensor, "b 6"]
@@ -161,6 +165,7 @@ class NuisancePriors:
             joint_offset_sigma=sigma,
             joint_offset_at=torch.zeros_like(sigma) if problem.joint_offset_at is None else problem.joint_offset_at,
             clock_at=still if problem.clock_at is None else problem.clock_at,
+            readout=level.readout,
             edge_bias=problem.noise.edge_bias[:, None, None].expand(-1, line_points(problem), problem.n_cameras),
             intrinsics=intrinsics[:, None].expand(-1, problem.n_cameras, -1),
             setup_at=_setup_at(problem),
@@ -197,6 +202,7 @@ def initial_state(nominal: NuisancePriors, R: Float[Tensor, "b 3 3"], t: Float[T
         rcm_offset=zero[:, None].expand(-1, 2),
         joint_offset=torch.zeros_like(nominal.joint_offset_at),
         clock=torch.zeros_like(nominal.clock_at),
+        readout=zero,
         edge_bias=torch.zeros_like(nominal.edge_bias),
         intrinsics=torch.zeros_like(nominal.intrinsics),
         setup=torch.zeros_like(nominal.setup_at),
@@ -233,6 +239,8 @@ def make_layout(
         entries.append(("clock", 1, torch.full_like(infinite, settings.clock_sigma_s)))
         if settings.clock_rate == "always":
             entries.append(("clock_rate", 1, torch.full_like(infinite, settings.clock_rate_sigma)))
+    if settings.readout == "always" and measured.clock is not None:
+        entries.append(("readout", 1, nominal.readout))
     if settings.edge_bias:
         entries.append(("edge_bias", origin.edge_bias[0].numel(), nominal.edge_bias.flatten(1)))
     if settings.intrinsics:
@@ -332,16 +340,18 @@ def _displaced(name: str, linear: LinearisedRows, measured: MeasurementRows, sta
     if name == "rcm_offset":
         return torch.stack([dot(linear.w, rotate(R, e)[:, None]) for e in rcm_axes(measured.R, measured.v)])
     if measured.joint is not None and name == "joint_offset":
-        return torch.stack([_effect(linear, R, motion) for motion in measured.joint.unbind(1)])
+        return torch.stack([displaced_rows(linear, R, motion) for motion in measured.joint.unbind(1)])
+    if name == "readout":
+        return read_later(linear, measured, state)[None]
     if name in ("compliance", GIVEN_WAY):
         axes = [rotate(R, e)[:, None] for e in (*rcm_axes(measured.R, measured.v), measured.v)]
         turns, shifts = [dot(linear.a, e) for e in axes[:TURNS]], [dot(linear.w, e) for e in axes]
         effects = torch.stack((*turns, *shifts))
         return effects if name == GIVEN_WAY else (effects[:, None] * basis(measured.pose)[:, None]).flatten(0, 1)
     if measured.setup is not None and name == "setup":
-        return torch.stack([_effect(linear, R, motion) for motion in measured.setup.unbind(1)])
+        return torch.stack([displaced_rows(linear, R, motion) for motion in measured.setup.unbind(1)])
     if measured.clock is not None and name in ("clock", "clock_rate"):
-        return _effect(linear, R, measured.clock[:, int(name == "clock_rate")])[None]
+        return displaced_rows(linear, R, measured.clock[:, int(name == "clock_rate")])[None]
     raise InputError(where=name, expected="derivatives of the kinematics", found="none")
 
 
@@ -350,9 +360,3 @@ def _shifts(measured: MeasurementRows, like: Float[Tensor, "k b n"]) -> Float[Te
     count = measured.row_kind.count(LINE)
     unit = torch.eye(like.shape[0], count, dtype=like.dtype, device=like.device)
     return unit[:, :, None, None] * measured.rows_ok[:, None]
-
-
-def _effect(linear: LinearisedRows, R: Tensor, displacement: Float[Tensor, "6 b n"]) -> Float[Tensor, "k b n"]:
-    """Effect of a displacement (rotation, translation; in `arm`) of the shaft on every row."""
-    turn, shift = rotate(R, displacement[:3]), rotate(R, displacement[3:])
-    return dot(linear.a, turn[:, None]) + dot(linear.w, shift[:, None])

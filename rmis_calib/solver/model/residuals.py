@@ -49,7 +49,7 @@ from torch import Tensor
 
 from rmis_calib.errors import InputError
 from rmis_calib.geometry.cameras import corrected_point
-from rmis_calib.solver.model.batched_linalg import cross, dot, rotate_trials
+from rmis_calib.solver.model.batched_linalg import batch_last, cross, dot, rotate, rotate_trials
 from rmis_calib.solver.model.forward_mode import load_forward_mode
 from rmis_calib.solver.model.linearised_rows import LinearisedRows
 from rmis_calib.solver.model.measurement_rows import MeasurementRows
@@ -65,6 +65,8 @@ MIN_COSINE = 1e-6
 
 def residual_rows(measured: MeasurementRows, state: State) -> Float[Tensor, "k b n"]:
     """Residuals alone."""
+    if measured.clock is not None and matters(state.readout):
+        return linearise(measured, state)[0].r
     shaft = predict_shaft(measured, state)
     own = [rows.among(measured.cameras, own_rows(rows, *shaft_poses(rows, measured, state))) for rows in measured.own]
     return torch.where(measured.rows_ok, torch.cat((_rows(measured, state, shaft), *own)), 0.0)
@@ -89,7 +91,29 @@ def linearise(measured: MeasurementRows, state: State) -> tuple[LinearisedRows, 
     shaft = predict_shaft(measured, state)
     built_in = _linearise_by_autograd if measured.autograd else _linearise_analytically
     linear = built_in(measured, state, shaft)
-    return with_own_rows(linear, measured, state, shaft) if measured.own else linear, shaft
+    linear = with_own_rows(linear, measured, state, shaft) if measured.own else linear
+    if measured.clock is not None and matters(state.readout):
+        linear = replace(linear, r=linear.r + state.readout[:, None] * read_later(linear, measured, state))
+    return linear, shaft
+
+
+def displaced_rows(linear: LinearisedRows, R: Tensor, displacement: Float[Tensor, "6 b n"]) -> Float[Tensor, "k b n"]:
+    """Effect on every row of a displacement (rotation, translation; in `arm`) of the shaft.
+
+    Args:
+        R: `camera_right_R_arm`, batch last.
+    """
+    turn, shift = rotate(R, displacement[:3]), rotate(R, displacement[3:])
+    return dot(linear.a, turn[:, None]) + dot(linear.w, shift[:, None])
+
+
+def read_later(linear: LinearisedRows, measured: MeasurementRows, state: State) -> Float[Tensor, "k b n"]:
+    """Effect of a second from a row to the one that is a focal length farther down: there the shaft is where it moves
+    to by then."""
+    if measured.clock is None:
+        raise InputError(where="readout", expected="derivatives of the kinematics by the clock", found="none")
+    R = batch_last(state.R, 2)[..., None]
+    return displaced_rows(linear, R, measured.clock[:, 0]) * measured.rows_y
 
 
 def _linearise_analytically(measured: MeasurementRows, state: State, shaft: Shaft) -> LinearisedRows:

@@ -24,6 +24,7 @@ class State:
         joint_offset: in each joint's unit.
         clock: seconds added to the time at which the joints were read in the middle of the recording, and what is added
             a second before and after it.
+        readout: seconds from reading a row to reading the one that is a focal length farther down.
         edge_bias: shift across its line that a line row of each camera has in every motion alike, normalised units.
         intrinsics: corrections of each camera, in the order of `cameras.corrected_point`.
         setup: `laparoscope_base_T_instrument_base` from where the kinematics were evaluated: right perturbation,
@@ -41,6 +42,7 @@ class State:
     rcm_offset: Float[Tensor, "b 2"]
     joint_offset: Float[Tensor, "b j"]
     clock: Float[Tensor, "b 2"]
+    readout: Float[Tensor, " b"]
     edge_bias: Float[Tensor, "b l c"]
     intrinsics: Float[Tensor, "b c 4"]
     setup: Float[Tensor, "b 6"]
@@ -81,7 +83,7 @@ class State:
                 changed[name] = getattr(self, name) + step[name]
         if "translation" in step:
             changed["t"] = self.t + step["translation"]
-        for name in ("radius", "end_offset"):
+        for name in ("radius", "end_offset", "readout"):
             if name in step:
                 changed[name] = getattr(self, name) + step[name][:, 0]
         parts = [step[name][:, 0] if name in step else self.clock[:, 0] * 0.0 for name in ("clock", "clock_rate")]

@@ -16,7 +16,13 @@ from rmis_calib.solver.model.residuals import linearise, residual_rows
 from rmis_calib.solver.settings import UnknownSettings
 
 EVERYTHING = UnknownSettings(
-    rcm_offset="always", joint_offsets="always", clock=True, clock_rate="always", setup="prior", compliance="always"
+    rcm_offset="always",
+    joint_offsets="always",
+    clock=True,
+    clock_rate="always",
+    readout="always",
+    setup="prior",
+    compliance="always",
 )
 
 
@@ -32,7 +38,14 @@ def scene(simulate):
     problem = replace(
         problem,
         noise=replace(
-            problem.noise, stereo_mm=one, stereo_rad=one, edge_bias=1e-3 * one, focal=one, centre=one, lens=one
+            problem.noise,
+            stereo_mm=one,
+            stereo_rad=one,
+            edge_bias=1e-3 * one,
+            focal=one,
+            centre=one,
+            lens=one,
+            readout=one,
         ),
         joint_derivative=joint,
         clock_derivative=clock,
@@ -118,7 +131,7 @@ def test_jacobian_of_every_unknown_equals_autodiff(scene):
     layout = make_layout(NuisancePriors.of(problem), measured, state, settings.unknowns, settings.noise)
     assert list(layout.blocks) == [
         "rotation", "translation", "stereo_rotation", "stereo_translation", "radius", "end_offset", "rcm_offset",
-        "joint_offset", "clock", "clock_rate", "edge_bias", "intrinsics", "setup", "compliance",
+        "joint_offset", "clock", "clock_rate", "readout", "edge_bias", "intrinsics", "setup", "compliance",
     ]  # fmt: skip
     exact = replace_measurements(measured, state)
     rows, shaft = linearise(exact, state)
