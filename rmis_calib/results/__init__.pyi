@@ -1,6 +1,7 @@
 from .parts import Change as Change
 from .parts import ClockJump as ClockJump
 from .parts import Consistency as Consistency
+from .parts import EndCounts as EndCounts
 from .parts import GroupShift as GroupShift
 from .parts import HeadPointError as HeadPointError
 from .parts import Information as Information
@@ -13,6 +14,7 @@ from .parts import PictureView as PictureView
 from .parts import Residual as Residual
 from .parts import ResidualTest as ResidualTest
 from .parts import Setup as Setup
+from .parts import ShaftEnds as ShaftEnds
 from .parts import Shift as Shift
 from .parts import Tests as Tests
 from .parts import covariance_of as covariance_of

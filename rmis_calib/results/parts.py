@@ -74,6 +74,50 @@ class Nuisance:
 
 
 @dataclass(frozen=True, config=FILE_PART)
+class EndCounts:
+    """Measured shaft ends of one kind, by the place of the instrument where they are."""
+
+    first_place: int
+    """Number at the place of most."""
+    second_place: int
+    """Number at the second place; 0 where there is one place only."""
+    left_out: int
+    """Number that is at neither and was not used."""
+
+
+@dataclass(frozen=True, config=FILE_PART)
+class ShaftEnds:
+    """At which places of the instrument its shaft ends were measured, both cameras together."""
+
+    by_kind: dict[str, EndCounts]
+    """By what the detector took them for: `tube`, `ring`, or `unknown` where it does not say."""
+    gap_mm: Number
+    """How far beyond the first place the second one lies, mm; null where there is one place only."""
+    gap_sigma_mm: Number
+    """1 sigma of it, mm; null likewise."""
+
+    @property
+    def first_place(self) -> int:
+        """Number of ends at the place of most."""
+        return sum(counts.first_place for counts in self.by_kind.values())
+
+    @property
+    def second_place(self) -> int:
+        """Number of ends at the second place."""
+        return sum(counts.second_place for counts in self.by_kind.values())
+
+    @property
+    def used(self) -> int:
+        """Number of ends that were used."""
+        return self.first_place + self.second_place
+
+    @property
+    def left_out(self) -> int:
+        """Number of ends that are at no such place."""
+        return sum(counts.left_out for counts in self.by_kind.values())
+
+
+@dataclass(frozen=True, config=FILE_PART)
 class HeadPointError:
     """Distance of the labelled head points of one camera from where the result puts them."""
 

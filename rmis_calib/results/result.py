@@ -35,6 +35,7 @@ from rmis_calib.results.parts import (
     PictureCheck,
     Residual,
     Setup,
+    ShaftEnds,
     Tests,
 )
 from rmis_calib.solver.observability import Observability
@@ -130,6 +131,9 @@ class CalibrationResult:
     instrument_base: InstrumentBase | None = None
     """The pose of the instrument's base in the camera, where the laparoscope stood still and the set-up was believed;
     absent elsewhere."""
+    ends: ShaftEnds | None = None
+    """At which places of the instrument its shaft ends were measured; absent where none was, and for `paper` and
+    `global`."""
     information: Information | None = None
     """What pooling with other recordings needs beside the covariance; null for `paper` and `global`."""
     picture: PictureCheck | None = None
@@ -201,7 +205,7 @@ class CalibrationResult:
     def to_dict(self) -> dict[str, Any]:
         """The result as plain JSON values, every number finite or None; the answer first."""
         record = record_type().dump_python(self, mode="json", by_alias=True)
-        for name in ("setup", "instrument_base", "tests", "picture"):  # as in results of before
+        for name in ("setup", "instrument_base", "tests", "picture", "ends"):  # as in results of before
             if record[name] is None:
                 del record[name]
         return {key: record[key] for key in (*_ANSWER, *record)}

@@ -68,6 +68,8 @@ class ObservationArrays:
             "contour_sigma": self._both("sigma_contour_{}", 2),
             "end_xy": self._both("end_{}", 2),
             "end_sigma": self._both("sigma_end_{}"),
+            "end_kind": self._both("end_kind_{}"),
+            "end_sureness": self._both("end_sureness_{}"),
             "head_xy": self._both("head_{}", 2),
             "head_sigma": self._both("sigma_head_{}"),
             "valid": valid & ~self._unknown[..., None, :],

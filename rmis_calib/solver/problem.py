@@ -82,6 +82,8 @@ class Problem:
         contour_sigma: [camera, motion, edge].
         end_xy: the shaft's end on the axis; only its place along the axis is used.
         end_sigma: along the axis.
+        end_kind: what a detector takes it for: 0 the tube's own end, 1 a ring that closes it; NaN: it does not say.
+        end_sureness: how probable the detector holds that; NaN: it does not say.
         head_xy: image of the head point.
         head_sigma: per coordinate.
         valid: motions in which this camera saw the shaft.
@@ -115,6 +117,8 @@ class Problem:
     contour_sigma: Float[Tensor, "*batch c n 2"]
     end_xy: Float[Tensor, "*batch c n 2"]
     end_sigma: Float[Tensor, "*batch c n"]
+    end_kind: Float[Tensor, "*batch c n"]
+    end_sureness: Float[Tensor, "*batch c n"]
     head_xy: Float[Tensor, "*batch c n 2"]
     head_sigma: Float[Tensor, "*batch c n"]
     valid: Bool[Tensor, "*batch c n"]

@@ -46,6 +46,9 @@ class UnknownSettings:
     """Estimate one constant offset of the shaft's end along the axis, where ends are measured."""
     end_offset_sigma_mm: NotNegative = 30.0
     """Prior of that offset."""
+    end_gap_sigma_mm: Positive = 15.0
+    """Prior of the distance between two places of the instrument at which ends are measured (the ring of the tube in
+    some pictures, the metal's tip in others), about zero; estimated where the ends are clearly at two places."""
     rcm_offset: Literal["never", "auto", "always"] = "auto"
     """Estimate by how much the shaft's axis misses the nominal RCM, two components across the axis, fixed to `rcm`
     (that of the laparoscope is part of the transform); `auto`: where the data ask for it."""

@@ -172,7 +172,8 @@ class Solution:
         residual_lines, residual_ends, residual_heads: rms per camera and motion, normalised units; NaN where not
             measured.
         residual_own: the same of the user's own measurements, by name, in their unit.
-        ends_elsewhere: number of measured shaft ends that are not at the place of most, and were left out.
+        ends: number of measured shaft ends, [kind, place]: of unknown kind, the tube's, a ring's; at the place of most,
+            at the second one, left out as they are at neither. None for `paper` and `global`.
         distance: Mahalanobis distance of each motion over the root of its rows; NaN where not measured.
         reason: `MotionReason` codes.
         noise: levels that were used, name -> value (`image`, `ends`, `heads` as factors on the nominal ones).
@@ -215,7 +216,7 @@ class Solution:
     bias: Float[Tensor, "*batch 6"]
     observability: ObservabilityTensors
     residual_own: dict[str, Float[Tensor, "*batch n"]] = field(default_factory=dict)
-    ends_elsewhere: Int[Tensor, "*batch"] | None = None
+    ends: Int[Tensor, "*batch 3 3"] | None = None
     posterior: Posterior | None = None
     groups: GroupCheck | None = None
     clock_jump: ClockJump | None = None
@@ -228,6 +229,11 @@ class Solution:
     evidence: dict[str, Float[Tensor, "*batch"]] = field(default_factory=dict)
     doubt: dict[str, Float[Tensor, "*batch 6 6"]] = field(default_factory=dict)
     information_kept: float = 1.0
+
+    @property
+    def ends_elsewhere(self) -> Int[Tensor, "*batch"] | None:
+        """Number of measured shaft ends that were left out as they are at no place that many share."""
+        return None if self.ends is None else self.ends[..., 2].sum(-1)
 
     @property
     def rotation_sigma_deg(self) -> Float[Tensor, "*batch"]:

@@ -19,7 +19,7 @@ import torch
 from data_synth.kinematics import pose_noise
 from data_synth.lines import _measure
 from data_synth.scene import Scene, build_scene, poses_at
-from data_synth.settings import LineStudyConfig
+from data_synth.settings import LineStudyConfig, SceneSettings
 from rmis_calib.geometry.rotations import matrix_to_rotvec
 from rmis_calib.solver import Problem, SolverSettings, solve
 from rmis_calib.solver.estimate.relinearise import scan_clock
@@ -125,10 +125,17 @@ class Recorded:
 
 
 def record(
-    trials: int, n: int, seed: int, offset=None, clock_s: float | np.ndarray = 0.0, stereo=(0.0, 0.0), rate: float = 0.0
+    trials: int,
+    n: int,
+    seed: int,
+    offset=None,
+    clock_s: float | np.ndarray = 0.0,
+    stereo=(0.0, 0.0),
+    rate: float = 0.0,
+    wrist_mm: float = 10.0,
 ) -> tuple[Recorded, torch.Tensor]:
     """A recording and its true transform."""
-    settings: LineStudyConfig = config(REALISTIC, trials, seed)
+    settings: LineStudyConfig = config(REALISTIC, trials, seed, scene=SceneSettings(wrist_length_mm=wrist_mm))
     scene = build_scene(settings.scene)
     generator = np.random.default_rng(seed)
     empty = Recorded(

@@ -8,6 +8,7 @@ import torch
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.geometry.rigid import RigidTransform
 from rmis_calib.io import Recording
+from rmis_calib.pipeline.answer.ends_record import about_ends, ends_of
 from rmis_calib.pipeline.answer.motion_names import NUMBERED, MotionNames
 from rmis_calib.pipeline.answer.setup_record import (
     about_compliance,
@@ -53,7 +54,7 @@ CORRECTED = 1.0
 """Correction of a camera in prior sigmas from which it is said."""
 WORTH_SAYING = 1.25
 """Growth of sigma by disagreeing groups from which it is said."""
-OF_ONE_RECORDING = ("clock", "clock_rate", "readout", "joint_offset", "rcm_offset", "setup")
+OF_ONE_RECORDING = ("clock", "clock_rate", "readout", "end_gap", "joint_offset", "rcm_offset", "setup")
 """Unknowns that another recording of the same set-up need not share."""
 TOO_FAR_SIGMA = 4.0
 """An unknown estimated this many prior sigmas from its nominal value says that the model does not fit the data."""
@@ -79,7 +80,7 @@ def make_result(
     notes = (
         *notes,
         *_about_tool(solution),
-        *_about_ends(solution),
+        *about_ends(solution),
         *about_groups(consistency, names),
         *about_cameras(solution),
         *about_setup(solution, frame, config.solver.unknowns),
@@ -103,6 +104,7 @@ def make_result(
         tests=tests,
         setup=setup_of(solution),
         instrument_base=instrument_base_of(solution),
+        ends=ends_of(solution),
         information=_information(solution),
         config=config.to_dict(),
     )
@@ -121,19 +123,6 @@ def _about_tool(solution: Solution) -> tuple[str, ...]:
         f"The shaft ends {abs(offset):.0f} mm {where} the place given by the tool's table: does the table belong "
         "to another tool (the wrists of S/Si and Classic instruments are 50 mm apart), or is the length of a wrist "
         "missing?",
-    )
-
-
-def _about_ends(solution: Solution) -> tuple[str, ...]:
-    """How many shaft ends were left out as they are not those of one place, in words."""
-    if solution.ends_elsewhere is None or not int(solution.ends_elsewhere):
-        return ()
-    left_out, used = int(solution.ends_elsewhere), int(torch.isfinite(solution.residual_ends).sum())
-    if not used:
-        return (f"The {left_out} measured shaft ends do not agree on one place along the shaft, and none was used.",)
-    return (
-        f"{left_out} of {left_out + used} measured ends of the shaft are at another place along it than most, and were "
-        "left out (the ring of the tube in some pictures, the metal's tip or what lies over it in others?).",
     )
 
 

@@ -168,8 +168,22 @@ def joint_solution(
         residual_ends=shown.ends,
         residual_heads=shown.heads,
         residual_own=shown.own,
-        ends_elsewhere=fit.problem.end_measured.sum((1, 2)) - measured.end_ok.sum((0, 2)),
+        ends=_ends(fit),
     )
+
+
+def _ends(fit: MapEstimate) -> Int[Tensor, "b 3 3"]:
+    """Ends by kind and place (`Solution.ends`), without those of pictures that were rejected."""
+    problem, rows = fit.problem, fit.model.measured
+    kept = torch.zeros_like(problem.end_measured)
+    second = torch.zeros_like(kept)
+    if rows.has_ends:
+        kept, second = rows.end_ok.transpose(0, 1), (rows.end_second > 0).transpose(0, 1)
+    used = kept & (fit.weight > REJECTED).transpose(0, 1)
+    places = torch.stack((used & ~second, used & second, problem.end_measured & ~kept), -1)
+    kind = problem.end_kind
+    kinds = torch.stack((torch.isnan(kind), kind == 0, kind == 1), -1)
+    return torch.einsum("bcnk,bcnp->bkp", kinds.double(), places.double()).round().long()
 
 
 def joint_on_graph(solution: Solution, problem: Problem, fit: MapEstimate, settings: SolverSettings) -> Solution:

@@ -29,7 +29,7 @@ from rmis_calib.solver.model.measurement_rows import LINE, MeasurementRows
 from rmis_calib.solver.model.normal_equations import NoiseModel, WeightedModel, image_variance, normal_equations
 from rmis_calib.solver.model.own_rows import own_rows, shaft_poses
 from rmis_calib.solver.model.predicted_shaft import Shaft, predict_shaft
-from rmis_calib.solver.model.residuals import _line_geometry, corrected_points
+from rmis_calib.solver.model.residuals import _line_geometry, corrected_points, predicted_s_end
 from rmis_calib.solver.model.state import State
 
 SIMULATED_PART = 16
@@ -107,7 +107,7 @@ def simulate(measured: MeasurementRows, state: State, noise: NoiseModel, draws: 
     )
     ends = measured.end_xy.shape[1]
     if measured.has_ends:
-        q = seen.p + (measured.s_end + state.end_offset[:, None]) * seen.d
+        q = seen.p + predicted_s_end(measured, state) * seen.d
         end_xy = q[:2] / q[2] + sigma[lines : lines + ends] * draws.end
         simulated = replace(simulated, end_xy=_uncorrected(end_xy, state))
     if measured.has_heads:

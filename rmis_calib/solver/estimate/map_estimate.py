@@ -9,17 +9,17 @@ from torch import Tensor
 
 from rmis_calib.errors import InsufficientDataError
 from rmis_calib.solver.estimate.bias import expected_score
+from rmis_calib.solver.estimate.end_places import with_places
 from rmis_calib.solver.estimate.gauss_newton import Refined, gauss_newton
 from rmis_calib.solver.estimate.multistart import cheirality, multistart
 from rmis_calib.solver.estimate.noise_levels import assumed_noise
-from rmis_calib.solver.estimate.noise_modes import settle_noise
 from rmis_calib.solver.estimate.one_step_update import one_step_update
 from rmis_calib.solver.estimate.outliers import REJECTED, classify, classify_contaminated
-from rmis_calib.solver.estimate.trusted_ends import trusted_ends
+from rmis_calib.solver.estimate.use_of_ends import Settled, Settling
 from rmis_calib.solver.model.batched_linalg import rescaled, unit_diagonal
 from rmis_calib.solver.model.measurement_rows import MeasurementRows, pack
-from rmis_calib.solver.model.normal_equations import Normal, WeightedModel, with_prior
-from rmis_calib.solver.model.parameters import NuisancePriors, initial_state, make_layout
+from rmis_calib.solver.model.normal_equations import NoiseModel, Normal, WeightedModel, with_prior
+from rmis_calib.solver.model.parameters import NuisancePriors, initial_state
 from rmis_calib.solver.model.state import State
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import SolverSettings
@@ -91,27 +91,38 @@ def map_estimate(problem: Problem, settings: SolverSettings, start: "MapEstimate
     order = motion_order(measured, settings.seed)
     if measured.trials == 1 and measured.motions > LONG and start is None:
         first = map_estimate(problem.select_motions(order[:LONG_SAMPLE]), replace(settings, bias_correction=False))
-        model = replace(first.model, measured=trusted_ends(measured, first.state, assumed), weight=None)
+        model = replace(first.model, measured=_with_same_places(measured, first, assumed), weight=None)
         refined, weight = one_step_update(model, first.state, settings, first.covariance)
         if refined is not None:
             return _finish(problem, replace(model, weight=weight), refined, settings)
     if start is None:
         state, noise, contaminated = multistart(problem, measured, order, assumed, free, settings)
-        measured = trusted_ends(measured, state, assumed)
+        used = with_places(measured, state, assumed)
     else:
         state, noise, contaminated = start.state, start.model.noise, (start.weight < REJECTED).any(-1).any(0)
-        measured = measured.with_ends_of(start.model.measured)
-    nominal = NuisancePriors.of(problem)
-    fresh = initial_state(nominal, state.R, state.t)
-    layout = make_layout(nominal, measured, fresh, settings.unknowns, settings.noise)
-    model = WeightedModel(measured, layout, noise, chunk=settings.chunk)
-    if start is not None:  # what the kinematics were evaluated at anew starts from zero, all else from where it was
+        used = measured.with_ends_of(start.model.measured)
+        fresh = initial_state(NuisancePriors.of(problem), state.R, state.t)
+        # What the kinematics were evaluated at anew starts from zero, all else from where it was.
         state = replace(state, joint_offset=fresh.joint_offset, clock=fresh.clock, setup=fresh.setup)
-    _check_rows(measured)
-    state, noise = settle_noise(model, state, order, contaminated, assumed, free, settings, start is None)
-    model = replace(model, noise=noise)
+    _check_rows(used)
+    settling = Settling(problem, measured, order, contaminated, assumed, free, settings)
+    fit = settling.settled(used, state, noise, start is None)
+    if start is None:
+        fit = settling.best_use_of_ends(Settled(used, state, noise), fit)
+    model, state = settling.model(fit.measured, fit.noise), fit.state
     refined, weight = _refine_all(model, state, contaminated | (settings.robust == "on"), settings)
     return _finish(problem, replace(model, weight=weight), refined, settings)
+
+
+def _with_same_places(measured: MeasurementRows, sample: MapEstimate, assumed: NoiseModel) -> MeasurementRows:
+    """All motions with their ends at the places that the estimate of a sample knows."""
+    if not sample.model.measured.has_ends:
+        return measured.without_ends()
+    found = with_places(measured, sample.state, assumed)
+    if "end_gap" in sample.model.layout.blocks:
+        return found
+    second = found.end_second > 0
+    return replace(found, end_ok=found.end_ok & ~second, end_second=torch.zeros_like(found.end_second))
 
 
 def motion_order(measured: MeasurementRows, seed: int) -> Int[Tensor, " n"]:

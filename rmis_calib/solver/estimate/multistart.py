@@ -13,6 +13,7 @@ from rmis_calib.solver.model.measurement_rows import MeasurementRows
 from rmis_calib.solver.model.normal_equations import NoiseModel, WeightedModel, camera_distance2
 from rmis_calib.solver.model.parameters import NuisancePriors, initial_state, make_layout
 from rmis_calib.solver.model.predicted_shaft import predict_shaft
+from rmis_calib.solver.model.residuals import predicted_s_end
 from rmis_calib.solver.model.state import State
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import SolverSettings
@@ -48,7 +49,7 @@ def cheirality(measured: MeasurementRows, state: State, used: Bool[Tensor, "c b 
     if measured.has_heads:
         kinds.append((shaft.p[2] + shaft.head[2] > 0, measured.head_ok & used))
     if measured.has_ends and not bool(measured.line_ok.any()):
-        s_end = measured.s_end + state.end_offset[:, None]
+        s_end = predicted_s_end(measured, state)
         kinds.append((shaft.p[2] + s_end * shaft.d[2] > 0, measured.end_ok & used))
     good = torch.stack([(front & ok).sum((0, 2)) for front, ok in kinds]).sum(0)
     return good / torch.stack([ok.sum((0, 2)) for _, ok in kinds]).sum(0).clamp_min(1)

@@ -69,6 +69,18 @@ def settle_noise(
     return settled.put(at, best_state), noise.put(at, best_noise)
 
 
+def log_posterior(
+    model: WeightedModel,
+    state: State,
+    contaminated: Bool[Tensor, " b"],
+    assumed: NoiseModel,
+    free: dict[str, Tensor],
+    settings: SolverSettings,
+) -> Float[Tensor, " b"]:
+    """Log of the posterior of the model's noise levels, up to a constant; the other arguments as of `settle_noise`."""
+    return _Search(model, contaminated, assumed, free, settings).log_posterior(state, model.noise)
+
+
 @dataclass(frozen=True)
 class _Search:
     """What the noise levels of some trials are found from: the arguments of `settle_noise`."""

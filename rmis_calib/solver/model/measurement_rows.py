@@ -85,6 +85,8 @@ class MeasurementRows:
         line_rho: signed contour (+1, -1) or axis (0).
         line_var: variance across the line before any scale; line_ok: measured.
         end_xy, end_var, end_ok: shaft ends.
+        end_kind, end_sureness: what a detector takes each for, and how sure it is; NaN where it does not say.
+        end_second: 1 for those that are measured at the second place of the instrument (`State.end_gap`), else 0.
         head_xy, head_var, head_ok: head points.
         camera_R: `camera_R_camera_right` as given, batch last.
         camera_t: its translation.
@@ -111,6 +113,9 @@ class MeasurementRows:
     end_xy: Float[Tensor, "2 e b n"]
     end_var: Float[Tensor, "e b n"]
     end_ok: Bool[Tensor, "e b n"]
+    end_kind: Float[Tensor, "e b n"]
+    end_sureness: Float[Tensor, "e b n"]
+    end_second: Float[Tensor, "e b n"]
     head_xy: Float[Tensor, "2 h b n"]
     head_var: Float[Tensor, "h b n"]
     head_ok: Bool[Tensor, "h b n"]
@@ -143,6 +148,11 @@ class MeasurementRows:
     @property
     def has_ends(self) -> bool:
         return self.end_xy.shape[1] > 0
+
+    @property
+    def has_second_place(self) -> bool:
+        """Whether any end is measured at another place than most."""
+        return self.has_ends and bool((self.end_second > 0).any())
 
     @property
     def has_heads(self) -> bool:
@@ -217,12 +227,26 @@ class MeasurementRows:
         return self.take_trials(torch.arange(self.trials, device=self.p.device).repeat_interleave(times))
 
     def with_ends_of(self, other: "MeasurementRows") -> "MeasurementRows":
-        """Only those shaft ends that the other rows, of the same motions, have too."""
-        return replace(self, end_ok=self.end_ok & other.end_ok) if other.has_ends else self.without_ends()
+        """Only those shaft ends that the other rows, of the same motions, have too, and at the same places."""
+        if not other.has_ends:
+            return self.without_ends()
+        return replace(self, end_ok=self.end_ok & other.end_ok, end_second=other.end_second)
+
+    def put_ends(self, index: Tensor, part: "MeasurementRows") -> "MeasurementRows":
+        """With what the trials `index` have of shaft ends replaced by that of others, of the same motions."""
+        ok, second = (
+            getattr(self, name).index_copy(1, index, getattr(part, name)) for name in ("end_ok", "end_second")
+        )
+        return replace(self, end_ok=ok, end_second=second)
+
+    def without_unused_ends(self) -> "MeasurementRows":
+        """Without ends at all where no trial has any."""
+        return self if not self.has_ends or bool(self.end_ok.any()) else self.without_ends()
 
     def without_ends(self) -> "MeasurementRows":
         """Without any shaft end."""
-        return replace(self, end_xy=self.end_xy[:, :0], end_var=self.end_var[:0], end_ok=self.end_ok[:0])
+        names = ("end_var", "end_ok", "end_kind", "end_sureness", "end_second")
+        return replace(self, end_xy=self.end_xy[:, :0], **{name: getattr(self, name)[:0] for name in names})
 
     def keep(self, camera_ok: Bool[Tensor, "c b n"]) -> "MeasurementRows":
         """Measurements of other cameras and motions marked as not measured."""
@@ -264,6 +288,9 @@ def pack(problem: Problem, noise: NoiseSettings) -> MeasurementRows:
         end_xy=end_xy,
         end_var=end_var,
         end_ok=end_ok,
+        end_kind=problem.end_kind.transpose(0, 1)[: len(end_ok)].contiguous(),
+        end_sureness=problem.end_sureness.transpose(0, 1)[: len(end_ok)].contiguous(),
+        end_second=torch.zeros_like(end_var),
         head_xy=head_xy,
         head_var=head_var,
         head_ok=head_ok,

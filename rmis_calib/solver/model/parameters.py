@@ -12,7 +12,7 @@ from rmis_calib.geometry.rigid import rigid_inverse, rigid_log
 from rmis_calib.solver.model.batched_linalg import add_cross_, batch_last, cross, dot, rotate
 from rmis_calib.solver.model.compliance import COUNT, FUNCTIONS, PRIORS, SHIFTS, TURNS, basis
 from rmis_calib.solver.model.linearised_rows import LinearisedRows
-from rmis_calib.solver.model.measurement_rows import LINE, MeasurementRows, line_points
+from rmis_calib.solver.model.measurement_rows import END, LINE, MeasurementRows, line_points
 from rmis_calib.solver.model.predicted_shaft import Shaft, rcm_axes
 from rmis_calib.solver.model.residuals import displaced_rows, intrinsic_effects, read_later
 from rmis_calib.solver.model.state import State
@@ -26,6 +26,7 @@ UNITS = {
     "stereo_translation": "mm",
     "radius": "mm",
     "end_offset": "mm",
+    "end_gap": "mm",
     "rcm_offset": "mm",
     "joint_offset": "rad or mm",
     "clock": "s",
@@ -102,6 +103,7 @@ class ParameterLayout:
             "stereo_translation": shifted,
             "radius": (state.radius - origin.radius)[:, None],
             "end_offset": (state.end_offset - origin.end_offset)[:, None],
+            "end_gap": (state.end_gap - origin.end_gap)[:, None],
             "rcm_offset": state.rcm_offset - origin.rcm_offset,
             "joint_offset": state.joint_offset - origin.joint_offset,
             "clock": (state.clock - origin.clock)[:, :1],
@@ -199,6 +201,7 @@ def initial_state(nominal: NuisancePriors, R: Float[Tensor, "b 3 3"], t: Float[T
         stereo_t=nominal.stereo[:, :3, 3],
         radius=nominal.radius,
         end_offset=zero,
+        end_gap=zero,
         rcm_offset=zero[:, None].expand(-1, 2),
         joint_offset=torch.zeros_like(nominal.joint_offset_at),
         clock=torch.zeros_like(nominal.clock_at),
@@ -229,6 +232,8 @@ def make_layout(
         entries.append(("radius", 1, settings.radius_sigma_relative * origin.radius))
     if settings.end_offset and measured.has_ends:
         entries.append(("end_offset", 1, torch.full_like(infinite, settings.end_offset_sigma_mm)))
+    if measured.has_second_place:
+        entries.append(("end_gap", 1, torch.full_like(infinite, settings.end_gap_sigma_mm)))
     if settings.rcm_offset == "always":
         # One that is stated to be none, and yet to be estimated, is one.
         rcm_mm = torch.where(nominal.rcm_mm > 0, nominal.rcm_mm, settings.rcm_offset_sigma_mm)
@@ -327,6 +332,8 @@ def columns_of(
         return linear.radius[None]
     if name == "end_offset":
         return linear.end[None]
+    if name == "end_gap":
+        return _at_second_place(measured, linear.end)[None]
     if name == "intrinsics":
         return intrinsic_effects(measured, state, shaft)
     if name == "edge_bias":
@@ -353,6 +360,14 @@ def _displaced(name: str, linear: LinearisedRows, measured: MeasurementRows, sta
     if measured.clock is not None and name in ("clock", "clock_rate"):
         return displaced_rows(linear, R, measured.clock[:, int(name == "clock_rate")])[None]
     raise InputError(where=name, expected="derivatives of the kinematics", found="none")
+
+
+def _at_second_place(measured: MeasurementRows, end: Float[Tensor, "k b n"]) -> Float[Tensor, "k b n"]:
+    """The effect of a longer shaft on the ends at the second place alone."""
+    rows = [index for index, kind in enumerate(measured.row_kind) if kind == END]
+    second = torch.zeros_like(end)
+    second[rows] = measured.end_second
+    return end * second
 
 
 def _shifts(measured: MeasurementRows, like: Float[Tensor, "k b n"]) -> Float[Tensor, "k s b n"]:

@@ -286,11 +286,17 @@ def _end_geometry(measured: MeasurementRows, state: State, shaft: Shaft) -> tupl
     step = d[:2] - chi * u[:2]
     across = torch.addcmul(step[1] * image_m[0], step[0], image_m[1], value=-1.0)
     slope = _held(measured, (across / m_xy).abs().clamp_min(1e-12) / X_u.abs())
-    s_end = (measured.s_end + state.end_offset[:, None]).expand_as(chi)
+    s_end = predicted_s_end(measured, state).expand_as(chi)
     gain = (shaft.D * slope).reciprocal()
     if measured.autograd:  # the same value; its derivative is that of the predicted end, seen from a held direction
         return -dot(_held(measured, d - chi * u), shaft.p + s_end * d) * _held(measured, gain), chi, s_end, gain
     return (chi - (shaft.s0 + s_end) / shaft.D) / slope, chi, s_end, gain
+
+
+def predicted_s_end(measured: MeasurementRows, state: State) -> Float[Tensor, "e b n"]:
+    """Coordinate along the axis of the place at which each end is measured, mm."""
+    first = measured.s_end + state.end_offset[:, None]
+    return first + measured.end_second * state.end_gap[:, None] if matters(state.end_gap) else first[None]
 
 
 def _head_geometry(measured: MeasurementRows, state: State, shaft: Shaft) -> tuple[Tensor, Tensor]:

@@ -20,6 +20,7 @@ class State:
         stereo_t: its translation, mm.
         radius: of the shaft, mm.
         end_offset: of the shaft's end along the axis, mm.
+        end_gap: how far beyond that the second place lies at which ends are measured, mm.
         rcm_offset: of the shaft's axis from the nominal RCM, along two directions across the axis, mm.
         joint_offset: in each joint's unit.
         clock: seconds added to the time at which the joints were read in the middle of the recording, and what is added
@@ -39,6 +40,7 @@ class State:
     stereo_t: Float[Tensor, "b 3"]
     radius: Float[Tensor, " b"]
     end_offset: Float[Tensor, " b"]
+    end_gap: Float[Tensor, " b"]
     rcm_offset: Float[Tensor, "b 2"]
     joint_offset: Float[Tensor, "b j"]
     clock: Float[Tensor, "b 2"]
@@ -83,7 +85,7 @@ class State:
                 changed[name] = getattr(self, name) + step[name]
         if "translation" in step:
             changed["t"] = self.t + step["translation"]
-        for name in ("radius", "end_offset", "readout"):
+        for name in ("radius", "end_offset", "end_gap", "readout"):
             if name in step:
                 changed[name] = getattr(self, name) + step[name][:, 0]
         parts = [step[name][:, 0] if name in step else self.clock[:, 0] * 0.0 for name in ("clock", "clock_rate")]

@@ -1,0 +1,45 @@
+"""Where along the instrument its shaft ends were measured, in a result and in words."""
+
+from rmis_calib.results import EndCounts, ShaftEnds
+from rmis_calib.solver import Solution
+
+KINDS = ("unknown", "tube", "ring")
+"""Kinds of end in the order of `Solution.ends`."""
+
+
+def ends_of(solution: Solution) -> ShaftEnds | None:
+    """Number of ends of each kind at each place; None where none was measured."""
+    if solution.ends is None or not int(solution.ends.sum()):
+        return None
+    counts = solution.ends.reshape(len(KINDS), 3).tolist()
+    gap = solution.nuisances.get("end_gap")
+    return ShaftEnds(
+        by_kind={kind: EndCounts(*each) for kind, each in zip(KINDS, counts, strict=True) if sum(each)},
+        gap_mm=None if gap is None else float(gap.value),
+        gap_sigma_mm=None if gap is None else float(gap.sigma),
+    )
+
+
+def about_ends(solution: Solution) -> tuple[str, ...]:
+    """Whether the ends are those of two places, and how many were left out, in words."""
+    ends = ends_of(solution)
+    if ends is None:
+        return ()
+    said = []
+    if ends.gap_mm is not None:
+        where = "beyond" if ends.gap_mm > 0 else "before"
+        said.append(
+            f"The ends of the shaft were measured at two places of the instrument: {ends.first_place} at one, and "
+            f"{ends.second_place} at another {abs(ends.gap_mm):.1f} mm {where} it (the ring of the tube and the tip of "
+            "the metal?). Both were used, each with a place of its own."
+        )
+    if ends.left_out and not ends.used:
+        said.append(
+            f"The {ends.left_out} measured shaft ends do not agree on one place along the shaft, and none was used."
+        )
+    elif ends.left_out:
+        said.append(
+            f"{ends.left_out} of {ends.left_out + ends.used} measured ends of the shaft are at another place along it "
+            "than most, and were left out (the metal's tip, or what lies over the shaft?)."
+        )
+    return tuple(said)
