@@ -1,6 +1,7 @@
 """The page in a browser, and what the command makes of its arguments."""
 
 import shutil
+import socket
 import subprocess
 import time
 from pathlib import Path
@@ -53,7 +54,9 @@ def test_a_browser_draws_the_scene(recording, tmp_path):
     pytest.importorskip("viser")
     from rmis_calib.viewer import open_viewer
 
-    viewer = open_viewer(recording, port=8123)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]  # the system's choice
+    viewer = open_viewer(recording, port=port)
     try:
         assert viewer.url.startswith("http://127.0.0.1:")
         viewer.show(2)
