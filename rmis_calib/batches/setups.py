@@ -55,6 +55,7 @@ class SetupComparison:
         changes: where another transform begins; the pooled one is then of no one state.
         segments: pooled transforms between the changes; one where there are none.
         drifts: offsets of joints, and of the clock, that grow.
+        copies: names of results that repeat another one to the last bit, and of that one; they do not count.
     """
 
     setup: str
@@ -64,6 +65,7 @@ class SetupComparison:
     changes: tuple[Change, ...]
     segments: tuple[Pooled, ...]
     drifts: tuple[Drift, ...]
+    copies: tuple[tuple[str, str], ...] = ()
 
     @property
     def answer(self) -> Pooled | None:
@@ -86,6 +88,13 @@ class SetupComparison:
         """What there is to say, most important first."""
         if self.pooled is None:
             return ["No recording of this set-up has a transform that can be compared."]
+        copied = [
+            f"{name} repeats {first} to the last digit: the same data, counted once." for name, first in self.copies
+        ]
+        return copied + self._about_results()
+
+    def _about_results(self) -> list[str]:
+        assert self.pooled is not None
         if len(self.names) == 1:
             return ["One recording: nothing to compare it with."]
         said = [
@@ -113,14 +122,21 @@ def compare(results: Sequence[CalibrationResult], names: Sequence[str], setup: s
     """Compare results of one set-up: pooled, with outliers named; changes of the transform; drifting offsets.
 
     Args:
-        results: in the order of their time; those without transform and covariance do not count.
+        results: in the order of their time; those without transform and covariance do not count, nor do copies: the
+            same data twice would halve the covariance of the pooled transform.
         names: of each.
         setup: what to call the set-up.
 
     Raises:
         InputError: recordings were told different diameters of the shaft, whose deviation is pooled too.
     """
-    pairs = [(name, result) for name, result in zip(names, results, strict=True) if can_be_pooled(result)]
+    firsts: dict[bytes, tuple[str, CalibrationResult]] = {}
+    copies = []
+    for name, result in zip(names, results, strict=True):
+        if can_be_pooled(result):
+            first, _ = firsts.setdefault(_digits(result), (name, result))
+            copies += [(name, first)] if first != name else []
+    pairs = list(firsts.values())
     kept_names, kept = tuple(name for name, _ in pairs), tuple(result for _, result in pairs)
     if not kept:
         return SetupComparison(setup, (), (), None, (), (), ())
@@ -134,7 +150,13 @@ def compare(results: Sequence[CalibrationResult], names: Sequence[str], setup: s
             found = changes(whole.deviation, own_covariances(kept))
     edges = [0, *(change.index for change in found), len(kept)]
     segments = tuple(pool(kept[a:b]) for a, b in pairwise(edges)) if found else (pooled,)
-    return SetupComparison(setup, kept_names, kept, pooled, tuple(found), segments, _drifts(kept))
+    return SetupComparison(setup, kept_names, kept, pooled, tuple(found), segments, _drifts(kept), tuple(copies))
+
+
+def _digits(result: CalibrationResult) -> bytes:
+    """Transform and covariance, bit for bit."""
+    assert result.camera_right_T_arm is not None and result.covariance is not None
+    return result.camera_right_T_arm.matrix.cpu().numpy().tobytes() + result.covariance.tobytes()
 
 
 def setups_of(out: Path, records: Sequence[JobRecord]) -> tuple[SetupComparison, ...]:

@@ -133,7 +133,7 @@ def conclude_comparison(comparison: "SetupComparison", results: "dict[str, Calib
     import numpy as np
 
     for name, result in results.items():
-        if name not in comparison.names:
+        if name not in comparison.names and name not in dict(comparison.copies):
             say(f"{name}: {result.status}, left out")
     if comparison.pooled is not None:
         pooled = comparison.pooled

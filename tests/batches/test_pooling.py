@@ -183,6 +183,17 @@ def test_information_is_kept_in_the_result_file(series, tmp_path) -> None:
     assert rc.CalibrationResult.from_dict(old).information is None
 
 
+def test_a_copy_of_a_result_does_not_count_again(series) -> None:
+    results, _ = series
+    once = compare(results[:3], ["a", "b", "c"])
+    twice = compare([results[0], *results[:3], results[1]], ["a", "b", "c", "d", "e"])
+    assert twice.copies == (("b", "a"), ("e", "c"))
+    assert twice.names == ("a", "c", "d")
+    assert once.pooled is not None and twice.pooled is not None
+    assert np.array_equal(once.pooled.covariance, twice.pooled.covariance)
+    assert twice.sentences()[0] == "b repeats a to the last digit: the same data, counted once."
+
+
 def test_what_cannot_be_pooled_is_refused(series) -> None:
     results, _ = series
     with pytest.raises(InputError, match="found none"):
