@@ -13,7 +13,8 @@ time of one thread for every method (so that other programs do not count), media
 the peers, of the medians of the error on the frames that both found; peers that found under a tenth of the frames are
 left out. A peer may find any of the shafts in the picture.
 
-Three more tables: how far the confidence can be believed, what strong barrel distortion costs, and the goals.
+Four more tables: how far the confidence can be believed, how many ends are near, what strong barrel distortion costs,
+and the goals.
 `--benches 60` instead counts shafts and what is none on laboratory benches: chessboards, cases, rulers, cables, print.
 Frames are streamed: memory does not depend on their number. `--keep` leaves the recordings for the next run.
 """
@@ -30,7 +31,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from bench_vision_real_frames import SURE, distances_px
+from bench_vision_real_frames import END_PX, SURE, distances_px
 from vision_peers import PEERS, best_threshold, dark_mask, undistort
 
 from data_synth import load_synth_config, render_bench, write_recording
@@ -272,6 +273,17 @@ def print_confidence(graded: list[tuple[float, bool, bool]]) -> None:
             print(f"| {name} | {len(part)} | {mean:.2f} | {100 * right:.1f} % | {100 * calm:.1f} % |")
 
 
+def print_ends(ours: dict[str, Tally]) -> None:
+    """Ends in view of found shafts: how many were given, and how near."""
+    print(
+        f"\n| preset | shafts found | ends given | within {END_PX:.0f} px | 90 % px |\n| --- | --- | --- | --- | --- |"
+    )
+    for preset, tally in ours.items():
+        if tally.end:
+            near = sum(px <= END_PX for px in tally.end)
+            print(f"| {preset} | {len(tally.rms)} | {len(tally.end)} | {near} | {np.quantile(tally.end, 0.9):.2f} |")
+
+
 def print_barrel(folder: Path, frames: int) -> None:
     """Precision under k1 = -0.35 against the same scene through a lens without distortion."""
     barrel = replace(load_synth_config("barrel"), motions=frames)
@@ -341,6 +353,7 @@ def main() -> None:
             for name, tally in tallies.items():
                 print(tally.row(preset, name, better.get(name, min(better.values(), default=np.nan))), flush=True)
         print_confidence([grade for tally in ours.values() for grade in tally.graded])
+        print_ends(ours)
         if not options.no_barrel:
             print_barrel(folder, options.frames)
     print_goals(ours)
