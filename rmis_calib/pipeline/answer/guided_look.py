@@ -111,6 +111,8 @@ def _with_looks(
     detector = ShaftDetector(config.detector, view.camera)
     searched = view.detections.reason != FrameReason.LEFT_OUT
     motions = [m for m in wanted.nonzero()[:, 0].tolist() if searched[run.poses.frames[m]]]
+    if not motions:
+        return view.detections, 0
     fields = {name: value.clone() for name, value in vars(view.detections).items()}
     gained = 0
     for first in range(0, len(motions), config.batch_size):
