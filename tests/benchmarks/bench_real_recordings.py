@@ -7,7 +7,8 @@ and rendered ones whose files say something wrong (broken_recordings.py).
 KEY=VALUE are settings of `calibrate`, such as `measurements=contours`. Columns: verdict; own sigma; distance from the
 reference (the nearest, where a recording has several that differ), in deg, mm, and in the sigmas of both together (M;
 4.49 is the bound of 3 sigma for 6 unknowns); median residuals of contours and ends; how many times the sigmas count as
-groups of motions disagree; and M of two halves of the motions, far from each other in joint space.
+groups of motions disagree; and M of two halves of the motions, far from each other in joint space. Below: the message;
+edges of the pictures off the predicted contours (median, spread, share of places), and what they say against it.
 """
 
 import argparse
@@ -62,6 +63,15 @@ def residual(result: CalibrationResult, kind: str) -> str:
     )
 
 
+def edges(result: CalibrationResult) -> str:
+    """Edges of the pictures off the predicted contours: median and spread, px, and share of places, right / left."""
+    views = {} if result.picture is None else result.picture.views
+    return " / ".join(
+        f"{view.median_px or 0:+.2f} +- {view.spread_px or 0:.2f}, {100 * view.edge_share:.0f} %"
+        for view in views.values()
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=Path(__file__).parents[3] / "shared/data")
@@ -108,7 +118,9 @@ def row(folder: Path, config: CalibrationConfig) -> None:
         f"{degrees:5.2f} deg {mm:5.1f} mm {M:5.2f}  {residual(result, 'contour'):14} {residual(result, 'end'):10} "
         f"{grown or 1.0:4.1f}  {halves or 0.0:5.1f}"
     )
-    print(f"{'':32} {result.message}", flush=True)
+    print(f"{'':32} {result.message}")
+    said = () if result.picture is None else result.picture.sentences
+    print("\n".join(f"{'':32} {line}" for line in (f"pictures: {edges(result)}", *said)), flush=True)
 
 
 if __name__ == "__main__":
