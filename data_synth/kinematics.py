@@ -170,8 +170,14 @@ class Shaft:
     rcm_s_end_mm: Array
 
 
-def arm_to_dict(arm: Arm, *, instrument: bool) -> dict[str, Any]:
-    """The arm as an entry of robot.yaml."""
+def arm_to_dict(arm: Arm, *, instrument: bool, offset_sigma: Mapping[str, float] | None = None) -> dict[str, Any]:
+    """The arm as an entry of robot.yaml.
+
+    Args:
+        arm: to write.
+        instrument: with its RCM, shaft and head point.
+        offset_sigma: how well the offsets are known, by kind of joint, rad and mm; None: not stated.
+    """
     entry: dict[str, Any] = {
         "base_T_arm_base": arm.base_T_arm_base.tolist(),
         "joints": [
@@ -183,6 +189,7 @@ def arm_to_dict(arm: Arm, *, instrument: bool) -> dict[str, Any]:
                 "theta_rad": j.theta_rad,
                 "d_mm": j.d_mm,
                 "offset": j.offset,
+                **({} if offset_sigma is None else {"offset_sigma": offset_sigma[j.kind]}),
             }
             for j in arm.joints
         ],

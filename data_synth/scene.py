@@ -8,6 +8,7 @@ Frames: `base`, `arm` (end of the laparoscope's arm), `rcm` (the instrument's re
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,16 +48,19 @@ class Scene:
     shaft_radius_mm: float
     shaft_end_offset_mm: float
 
-    def robot_dict(self, name: str, *, laparoscope: bool = True) -> dict:
-        """The content of robot.yaml."""
-        arms = {"laparoscope": arm_to_dict(self.laparoscope, instrument=False)} if laparoscope else {}
+    def robot_dict(
+        self, name: str, *, laparoscope: bool = True, offset_sigma: Mapping[str, float] | None = None
+    ) -> dict:
+        """The content of robot.yaml; `offset_sigma` as in `arm_to_dict`."""
+        told = {"offset_sigma": offset_sigma}
+        arms = {"laparoscope": arm_to_dict(self.laparoscope, instrument=False, **told)} if laparoscope else {}
         exact = {"rcm_sigma_mm": 0.0}
         exact |= {"setup_sigma_mm": 0.0, "setup_sigma_deg": 0.0} if laparoscope else {}
         return {
             "name": name,
             "dh_convention": self.instrument.convention,
             **exact,
-            "arms": arms | {"instrument": arm_to_dict(self.instrument, instrument=True)},
+            "arms": arms | {"instrument": arm_to_dict(self.instrument, instrument=True, **told)},
         }
 
 

@@ -147,6 +147,8 @@ class NoiseSettings:
     """Constant error of each logged revolute joint, drawn once, 1 sigma: truth = reading + offset."""
     joint_offset_mm: NonNegative = 0.0
     """Constant error of each logged prismatic joint."""
+    joint_offset_told: bool = False
+    """robot.yaml states the two above as each joint's `offset_sigma`."""
     clock_offset_s: float = 0.0
     """Time of a joint sample minus the time of the frame that shows it; not told to the calibration."""
     timestamp_noise_s: NonNegative = 0.0

@@ -96,7 +96,11 @@ def _write_tables(folder: Path, world: World, truths: dict[str, SideTruth]) -> N
     if config.camera.readout_told:
         recording["rolling_shutter_s"] = _first_to_last_row_s(world)
     _write_yaml(folder / "recording.yaml", recording)
-    _write_yaml(folder / "robot.yaml", scene.robot_dict("synthetic-rcm-3x3", laparoscope=logged))
+    noise, told = config.noise, None
+    if noise.joint_offset_told:
+        told = {"revolute": float(np.deg2rad(noise.joint_offset_deg)), "prismatic": noise.joint_offset_mm}
+    robot = scene.robot_dict("synthetic-rcm-3x3", laparoscope=logged, offset_sigma=told)
+    _write_yaml(folder / "robot.yaml", robot)
     _write_yaml(folder / "stereo.yaml", _stereo(world, generator))
     header, rows, offsets = _joint_log(world, logged, generator)
     _write_csv(folder / "joints.csv", header, rows)

@@ -39,6 +39,8 @@ class Joint:
     """Least reading, rad or mm; None where the limits are not known."""
     max: float | None = None
     """Greatest reading, rad or mm."""
+    offset_sigma: float | None = None
+    """How well the offset is known, 1 sigma, rad or mm. Zero: exactly. None: nobody states it."""
 
     @property
     def unit(self) -> JointUnit:

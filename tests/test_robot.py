@@ -1,9 +1,11 @@
 """The description of a robot: names of columns, units, and the arms that it has."""
 
 import pytest
+import yaml
 
 from rmis_calib.errors import RobotError
 from rmis_calib.io import load_robot
+from rmis_calib.io.robot import robot_to_dict
 from rmis_calib.robot import Joint, joint_column, split_joint_column
 
 
@@ -30,3 +32,23 @@ def test_joints_of_several_arms_in_the_order_of_their_tables() -> None:
 def test_only_the_instrument_has_a_shaft() -> None:
     arms = load_robot("dvrk-classic").arms
     assert arms["instrument"].is_instrument and not arms["laparoscope"].is_instrument
+
+
+def test_robot_states_how_well_the_offsets_of_its_joints_are_known(tmp_path) -> None:
+    robot = load_robot("rcm-3x3")
+    content = robot_to_dict(robot)
+    for joint, sigma in zip(content["arms"]["instrument"]["joints"], (0.0, 0.003, 0.5), strict=False):
+        joint["offset_sigma"] = sigma
+    (tmp_path / "robot.yaml").write_text(yaml.safe_dump(content))
+    told = load_robot(tmp_path / "robot.yaml")
+    assert [joint.offset_sigma for joint in told.arms["instrument"].joints[:3]] == [0.0, 0.003, 0.5]
+    assert all(joint.offset_sigma is None for joint in told.arms["laparoscope"].joints)
+    assert robot_to_dict(told)["arms"]["instrument"]["joints"] == content["arms"]["instrument"]["joints"]
+    for wrong, found in (
+        (-0.1, "expected 0 or more, found -0.1"),
+        (3.0, "expected offset_sigma at most 0.2 rad, found 3"),
+    ):
+        content["arms"]["instrument"]["joints"][0]["offset_sigma"] = wrong
+        (tmp_path / "robot.yaml").write_text(yaml.safe_dump(content))
+        with pytest.raises(RobotError, match=found):
+            load_robot(tmp_path / "robot.yaml")

@@ -225,8 +225,8 @@ def _extrinsics(given: Arrays) -> np.ndarray:
 
 
 def _unknowns(given: Arrays, n: int) -> Arrays:
-    """The three arrays about offsets of joints and clock, or none."""
-    present = [name for name in UNKNOWNS if name in given]
+    """The three arrays about offsets of joints and clock, or none; and their sigmas, where these are given."""
+    present = [name for name in (*UNKNOWNS, "unknown_sigma") if name in given]
     if not present:
         return {}
     for other in UNKNOWNS:
@@ -246,6 +246,13 @@ def _unknowns(given: Arrays, n: int) -> Arrays:
             found = array.shape if array.shape != shape else "NaN"
             raise ObservationsError(where=name, expected=f"finite numbers of shape {shape}", found=found)
         out[name] = array
+    if "unknown_sigma" in given:
+        array = _numbers("unknown_sigma", given["unknown_sigma"])
+        if array.shape != (len(names),) or bool((array < 0).any()):
+            found = array.shape if array.shape != (len(names),) else f"{np.nanmin(array):g}"
+            expected = f"numbers of shape {(len(names),)}, not negative (NaN: not known)"
+            raise ObservationsError(where="unknown_sigma", expected=expected, found=found)
+        out["unknown_sigma"] = array
     size = np.abs(out["unknown_displacement"][:, names != CLOCK_RATE])  # the unit of a rate is the whole recording
     turn, shift = (float(part.max(initial=0.0)) for part in (size[..., :3], size[..., 3:]))
     if turn > _MAX_TURN_RAD or shift > _MAX_SHIFT_MM:

@@ -143,6 +143,10 @@ class StereoSchema(Schema):
         return self
 
 
+LARGEST_OFFSET_SIGMA_RAD = 0.2
+"""12 deg: an encoder of which so little is known has its offset measured, not estimated."""
+
+
 class JointSchema(Schema):
     name: Name
     type: JointType
@@ -153,6 +157,7 @@ class JointSchema(Schema):
     offset: float
     min: float | None = None
     max: float | None = None
+    offset_sigma: Annotated[float, Field(ge=0)] | None = None
 
     @model_validator(mode="after")
     def _sane(self) -> "JointSchema":
@@ -163,6 +168,9 @@ class JointSchema(Schema):
         readings = [self.offset, *(limit for limit in (self.min, self.max) if limit is not None)]
         if self.type == "revolute" and max(map(abs, readings)) > FULL_TURN_RAD:
             raise ValueError(f"{DEGREES}; expected offset, min and max within one turn, found {readings}")
+        if self.type == "revolute" and (self.offset_sigma or 0.0) > LARGEST_OFFSET_SIGMA_RAD:
+            expected = f"expected offset_sigma at most {LARGEST_OFFSET_SIGMA_RAD:g} rad"
+            raise ValueError(f"{DEGREES}; {expected}, found {self.offset_sigma:g}")
         if self.type == "prismatic" and 0 < max(map(abs, readings[1:]), default=0.0) < 1.0:
             raise ValueError(f"{METRES}; expected limits in mm, found {readings[1:]}")
         return self

@@ -77,6 +77,9 @@ class ShaftObservations:
     translation v ds."""
     unknown_at: np.ndarray | None = None
     """(U,) offsets at which the kinematics in this file were evaluated."""
+    unknown_sigma: np.ndarray | None = None
+    """(U,) 1 sigma of each joint's offset about zero, rad or mm; 0: there is none; NaN, or no such array: nobody states
+    it."""
     laparoscope_base_T_arm: np.ndarray | None = None
     """(N, 4, 4), mm: forward kinematics of the laparoscope's arm in its own base. With it the set-up, the pose of the
     instrument's base in the laparoscope's, can be an unknown."""

@@ -57,7 +57,8 @@ def _arm_to_dict(arm: Arm) -> dict:
     for joint in arm.joints:
         row = {key: getattr(joint, key) for key in ("name", "type", "alpha_rad", "a_mm", "theta_rad", "d_mm", "offset")}
         limits = {} if joint.min is None else {"min": joint.min, "max": joint.max}
-        content["joints"].append(row | limits)
+        known = {} if joint.offset_sigma is None else {"offset_sigma": joint.offset_sigma}
+        content["joints"].append(row | limits | known)
     if not np.array_equal(arm.end_T_tool, np.eye(4)):
         content["end_T_tool"] = np.asarray(arm.end_T_tool).tolist()
     if arm.head_point is not None:

@@ -55,12 +55,12 @@ class UnknownSettings:
     rcm_offset_sigma_mm: NotNegative = 1.0
     """Prior of each component."""
     joint_offsets: Literal["auto", "always", "never"] = "auto"
-    """Estimate constant joint offsets, where the derivatives of the kinematics are in the problem. `calibrate` does so
-    first with `auto`, and leaves them out again unless the data are strong evidence of them: a robot without offsets
-    is calibrated three times more exactly without these unknowns."""
-    joint_offset_belief: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.8
-    """With `auto`: probability, before the data speak, that the encoders have offsets of about their prior. It decides
-    how much the covariance allows for offsets that were left out, not the estimate; 0 trusts the encoders."""
+    """Estimate constant joint offsets, where the derivatives of the kinematics are in the problem. With `auto` the data
+    tell how large they are, from none to twice the prior: the covariance of `calibrate` and `solve` counts all sizes,
+    and offsets are part of the answer where there is strong evidence of them. `always`: within the prior."""
+    joint_offset_belief: Annotated[float, Field(ge=0.0, le=1.0)] = 1.0
+    """With `auto`: probability, before the data speak, that the encoders have offsets of any size; 0 trusts the
+    encoders."""
     joint_offset_sigma_deg: NotNegative = 0.5
     """Prior of the offset of a revolute joint."""
     joint_offset_sigma_mm: NotNegative = 1.0

@@ -20,16 +20,14 @@ from rmis_calib.solver.test_list import TestList
 @dataclass(frozen=True)
 class Nuisance:
     """An unknown that was estimated beside the transform: value, 1 sigma, unit, whether the data could not tell it
-    (held), how many sigmas of its prior it was pulled from its nominal value, the log of the odds, in the light of the
-    data, that all of it is exactly nominal, and the projection onto its combinations that the data do not see, in units
-    of the priors."""
+    (held), how many sigmas of its prior it was pulled from its nominal value, and the projection onto its combinations
+    that the data do not see, in units of the priors."""
 
     value: Float[Tensor, "*batch k"]
     sigma: Float[Tensor, "*batch k"]
     unit: str
     held: Bool[Tensor, "*batch k"]
     pull: Float[Tensor, "*batch k"]
-    log_odds_nominal: Float[Tensor, "*batch"]
     unseen: Float[Tensor, "*batch k k"]
 
 
@@ -333,4 +331,4 @@ def _nuisance(name: str, group: Solution, groups: list[Solution]) -> Nuisance:
     other = next(each.nuisances[name] for each in groups if name in each.nuisances)
     empty = other.value.new_full((len(group.status), other.value.shape[-1]), torch.nan)
     none_seen = torch.eye(empty.shape[-1], dtype=empty.dtype, device=empty.device).repeat(len(empty), 1, 1)
-    return Nuisance(empty, empty, other.unit, torch.ones_like(empty, dtype=torch.bool), empty, empty[:, 0], none_seen)
+    return Nuisance(empty, empty, other.unit, torch.ones_like(empty, dtype=torch.bool), empty, none_seen)

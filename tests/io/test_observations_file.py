@@ -51,6 +51,7 @@ def everything() -> dict[str, Any]:
         "unknown_names": np.array(["laparoscope.yaw_rad", "instrument.insertion_mm", "clock_s"]),
         "unknown_displacement": generator.normal(size=(N, 3, 6)),
         "unknown_at": np.array([0.001, 0.1, 0.02]),
+        "unknown_sigma": np.array([0.002, 0.0, np.nan]),
     }
     levels = [f"sigma_{what}_{unit}" for what in ("kinematics", "camera", "stereo") for unit in ("mm", "rad")]
     arrays |= dict.fromkeys(levels, 0.0)
@@ -226,6 +227,10 @@ BAD = {
     "displacements of other offsets": (
         replace("unknown_displacement", np.zeros((N, 2, 6))),
         r"unknown_displacement: expected finite numbers of shape \(6, 3, 6\), found \(6, 2, 6\)",
+    ),
+    "negative sigma of an offset": (
+        replace("unknown_sigma", np.array([0.1, -0.1, 0.0])),
+        r"unknown_sigma: expected numbers of shape \(3,\), not negative",
     ),
     "displacements in degrees": (
         replace("unknown_displacement", np.full((N, 3, 6), 57.3)),

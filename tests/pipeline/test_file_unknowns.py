@@ -135,3 +135,30 @@ def test_the_table_of_another_tool_is_named(solved):
 
     assert any("mm before the place" in words and "another tool" in words for words in sentences(other))
     assert not any("another tool" in words for words in sentences(seen))
+
+
+def test_what_the_robot_states_of_its_encoders_wins(solved, tmp_path):
+    """Exact encoders are believed; others have the prior that is stated, in the recording and in the file alike."""
+    _, seen, unknowns, path = solved
+    recording = rc.load_recording(path, clock_offset_s=CLOCK_S)
+    arms = {
+        name: replace(arm, joints=tuple(replace(joint, offset_sigma=0.002) for joint in arm.joints))
+        for name, arm in recording.robot.arms.items()
+    }
+    stated = replace(recording, robot=replace(recording.robot, arms=arms))
+    told = KinematicUnknowns(stated, motion_poses(stated).frames, "cpu")
+    settings = parse_config({}).solver.unknowns
+    moves = told.moves_shaft()
+    assert bool((told.prior_sigma(settings)[moves] == 0.002).all())
+    assert bool((unknowns.prior_sigma(settings)[moves] > 0.005).all())
+    zero = torch.zeros(len(told.columns), dtype=torch.float64)
+    replace(seen, **told.displacements(zero)).save(tmp_path / "told.npz")
+    read = FileUnknowns(rc.ShaftObservations.load(tmp_path / "told.npz"), "cpu")
+    torch.testing.assert_close(read.stated_sigma, told.stated_sigma)
+    exact = replace(seen, unknown_sigma=np.zeros(len(seen.unknown_names)))
+    believed = rc.solve(exact, parse_config({"clock_search_s": 0.3}), throw=False)
+    never = rc.solve(
+        seen, parse_config({"clock_search_s": 0.3, "solver": {"unknowns": {"joint_offsets": "never"}}}), throw=False
+    )
+    np.testing.assert_allclose(believed.covariance, never.covariance, rtol=1e-9)
+    assert not any(name.startswith("joint_offset") for name in believed.nuisances)

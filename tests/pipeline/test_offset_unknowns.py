@@ -126,8 +126,8 @@ def test_what_the_transform_absorbs_of_joint_offsets_is_said():
     unseen[:2, :2] = torch.tensor([[0.5, -0.5], [-0.5, 0.5]])
     unseen[2, 2] = 1.0
     held = torch.tensor([False, False, True, True])
-    offsets = Nuisance(value, value + 1e-3, "rad or mm", held, value, value[0], unseen)
-    said = _about_offsets(offsets, unseen, torch.tensor([True, True, True, False]), columns, 0.5)
+    offsets = Nuisance(value, value + 1e-3, "rad or mm", held, value, unseen)
+    said = _about_offsets(offsets, unseen, torch.tensor([True, True, True, False]), columns, "")
     assert "those of laparoscope.insertion cannot be separated from the transform" in said
     assert "a combination of those of laparoscope.yaw, instrument.yaw cannot be separated from the transform" in said
     assert "wrist" not in said

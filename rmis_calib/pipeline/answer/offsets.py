@@ -17,9 +17,10 @@ from rmis_calib.solver import Problem, Solution
 from rmis_calib.solver import solve as solve_problem
 from rmis_calib.solver.assess.evidence import CHANCE
 from rmis_calib.solver.assess.left_out import freed
+from rmis_calib.solver.assess.offset_sizes import OffsetSizes, offset_sizes
 from rmis_calib.solver.estimate.relinearise import scan_clock
 from rmis_calib.solver.own_measurement import Measurement
-from rmis_calib.solver.settings import SolverSettings
+from rmis_calib.solver.settings import SolverSettings, UnknownSettings
 from rmis_calib.solver.solution import AlternativeModel, Nuisance
 
 COARSE_CLOCK_STEP_S, CLOCK_STEP_S = 0.1, 0.02
@@ -32,8 +33,6 @@ RATE_SEARCH = 0.05
 """Rates of the clock that are tried: a video of 24 frames a second written as one of 25 is 0.04 off."""
 SCANNED_MOTIONS = 64
 """Motions on which they are tried, at most twice as many."""
-STRONG_EVIDENCE = 3.0
-"""Log of the odds, 20 to 1, that the data must give for joint offsets to be estimated (Kass & Raftery 1995: strong)."""
 MIXED_SHARE = 0.1
 """Part of a joint's offset that must lie in the unseen combinations for the joint to be named with them."""
 
@@ -49,8 +48,8 @@ def estimate_with_kinematics(
     them, in sentences.
 
     A combination of offsets that the data cannot tell from the transform (its sigma stays at its prior) is held at
-    zero: its prior would else be counted as uncertainty of a transform that absorbs it anyway. With `auto` all offsets
-    are left out unless there is strong evidence of them; the covariance then allows for the other possibility.
+    zero: its prior would else be counted as uncertainty of a transform that absorbs it anyway. With `auto` the data say
+    how large the offsets are of which nobody states it, and the covariance counts all sizes (`offset_sizes`).
 
     Args:
         observations: N motions.
@@ -79,21 +78,23 @@ def estimate_with_kinematics(
     offsets, moves = solution.nuisances["joint_offset"], sigma > 0
     unseen = offsets.unseen
     if bool(offsets.held.all()):
-        about = _about_offsets(offsets, unseen, moves, unknowns.columns, 0.0)
+        about = _about_offsets(offsets, unseen, moves, unknowns.columns, "")
         return moving.solve(sigma * 0.0), (*about_clock, about)
     if bool((unseen[moves][:, moves] != 0).any()):
         solution = moving.solve(sigma, seen=_without_directions(unseen, sigma))
         offsets = solution.nuisances["joint_offset"]
-    belief = offsets.log_odds_nominal.new_tensor(asked.joint_offset_belief)
-    probability = torch.sigmoid(torch.logit(belief) - offsets.log_odds_nominal)
-    notes = (*about_clock, _about_offsets(offsets, unseen, moves, unknowns.columns, float(probability)))
-    if asked.joint_offsets == "always" or bool(offsets.log_odds_nominal < -STRONG_EVIDENCE):
-        return solution, notes
-    covariance = solution.covariance
+    unstated = moves & unknowns.stated_sigma.isnan()
+    if asked.joint_offsets == "always" or not bool(unstated.any()):
+        return solution, (*about_clock, _about_offsets(offsets, unseen, moves, unknowns.columns, ""))
+    kept = solution
     if "setup" in solution.doubt:  # the last solve allows for it itself
-        covariance = covariance - solution.doubt["setup"]
-    with_offsets = AlternativeModel(solution.camera_right_T_arm, covariance, probability)
-    return moving.solve(sigma * 0.0, with_offsets), notes
+        kept = replace(solution, covariance=solution.covariance - solution.doubt["setup"])
+    sizes = offset_sizes(kept, asked.joint_offset_belief, unstated)
+    chosen = sizes.chosen
+    notes = (*about_clock, _about_offsets(offsets, unseen, moves, unknowns.columns, _about_size(sizes, asked)))
+    seen = _without_directions(unseen, sigma)
+    sized = torch.where(unstated, sigma * sizes.size[chosen], sigma)
+    return moving.solve(sized, sizes.besides(chosen), seen), notes
 
 
 @dataclass(frozen=True)
@@ -158,7 +159,7 @@ def _without_directions(unseen: Float[Tensor, "j j"], sigma: Float[Tensor, " j"]
 
 
 def _about_offsets(
-    offsets: Nuisance, unseen: torch.Tensor, moves: torch.Tensor, columns: tuple[str, ...], probability: float
+    offsets: Nuisance, unseen: torch.Tensor, moves: torch.Tensor, columns: tuple[str, ...], size: str
 ) -> str:
     """Whether the encoders have offsets, what would not show, and what is part of the transform.
 
@@ -167,7 +168,7 @@ def _about_offsets(
         unseen: projection onto the combinations that the data do not see, in units of the priors.
         moves: which joints move the shaft; the others (the wrist's) are no part of anything.
         columns: name of each joint, with its unit.
-        probability: that there are offsets at all.
+        size: how large they probably are, in a sentence; empty where their prior was asked for.
     """
     names = [split_joint_column(column)[0] for column in columns]
     sigmas, held, shares = offsets.sigma.tolist(), offsets.held.tolist(), unseen.diagonal().tolist()
@@ -178,10 +179,7 @@ def _about_offsets(
         return f"Constant joint offsets cannot be separated from the transform here, and are part of it ({hidden})."
     mixed = [name for name, _, _, is_held, share in visible if not is_held and share > MIXED_SHARE]
     seen = ", ".join(f"{name} {_shown(sigma, column)}" for name, column, sigma, is_held, _ in visible if not is_held)
-    note = (
-        f"Estimated probability of constant encoder offsets: {100.0 * probability:.0f} %. If present, this recording "
-        f"would measure them to (1 sigma): {seen}"
-    )
+    note = f"{size}This recording measures constant encoder offsets to (1 sigma): {seen}"
     if hidden:
         note += f"; those of {hidden} cannot be separated from the transform and are part of it"
     if len(mixed) > 1:
@@ -189,6 +187,15 @@ def _about_offsets(
             f"; a combination of those of {', '.join(mixed)} cannot be separated from the transform and is part of it"
         )
     return f"{note}."
+
+
+def _about_size(sizes: OffsetSizes, asked: UnknownSettings) -> str:
+    """How large constant offsets probably are."""
+    each = (("rad", np.deg2rad(asked.joint_offset_sigma_deg)), ("mm", asked.joint_offset_sigma_mm))
+    middle, most = (
+        ", ".join(_shown(sizes.quantile(level) * prior, f"_{unit}") for unit, prior in each) for level in (0.5, 0.95)
+    )
+    return f"Constant encoder offsets are probably about {middle}, and below {most} with a probability of 95 %. "
 
 
 def _shown(sigma: float, column: str) -> str:

@@ -49,7 +49,10 @@ class KinematicUnknowns(OffsetUnknowns):
             recording.robot, recording.laparoscope_arm, recording.instrument_arm, device=device
         )
         arms = [arm for arm in (recording.laparoscope_arm, recording.instrument_arm) if arm is not None]
-        self.columns = tuple(recording.robot.joints(*arms))
+        joints = recording.robot.joints(*arms)
+        self.columns = tuple(joints)
+        sigmas = [np.nan if joint.offset_sigma is None else joint.offset_sigma for joint in joints.values()]
+        self.stated_sigma = torch.tensor(sigmas, dtype=torch.float64, device=device)
         self._log = recording.joints.select(self.columns)
         self._times, self._middle_s = recording.joint_times_s[frames], recording.middle_s
         self.motions, self.half_s = len(frames), float(np.abs(self._times - self._middle_s).max(initial=0.0))

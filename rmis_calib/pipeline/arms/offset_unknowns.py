@@ -44,6 +44,7 @@ class OffsetUnknowns(ABC):
         laparoscope_joints: how many of them are the laparoscope's.
         has_clock: whether a clock offset means anything.
         clock_at: the clock to start from; None: it must be searched for.
+        stated_sigma: (J,) 1 sigma of each joint offset, rad or mm, where somebody states it; NaN elsewhere.
         motions: M.
         half_s: time from the middle of the recording to the motion that is furthest from it.
     """
@@ -52,6 +53,7 @@ class OffsetUnknowns(ABC):
     laparoscope_joints: int
     has_clock: bool
     clock_at: tuple[float, float] | None
+    stated_sigma: Float[Tensor, " j"]
     motions: int
     half_s: float
 
@@ -106,11 +108,14 @@ class OffsetUnknowns(ABC):
         return derivative.abs().amax(dim=(0, 1, 2)) > least
 
     def prior_sigma(self, settings: UnknownSettings) -> Float[Tensor, " j"]:
-        """Prior of each offset, rad or mm; zero for a joint that does not move the shaft."""
+        """Prior of each offset, rad or mm: what is stated, else the settings'; zero for a joint that does not move the
+        shaft."""
         sigma = {"rad": np.deg2rad(settings.joint_offset_sigma_deg), "mm": settings.joint_offset_sigma_mm}
         values = [sigma[split_joint_column(column)[1]] for column in self.columns]
         moves = self.moves_shaft()
-        return torch.where(moves, torch.tensor(values, dtype=torch.float64, device=moves.device), 0.0)
+        assumed = torch.tensor(values, dtype=torch.float64, device=moves.device)
+        stated = self.stated_sigma.to(assumed)
+        return torch.where(moves, torch.where(stated.isnan(), assumed, stated), 0.0)
 
     def displacements(
         self, joint_offset: Float[Tensor, " j"], clock: tuple[float, float] = NO_CLOCK
@@ -123,7 +128,11 @@ class OffsetUnknowns(ABC):
             derivative = torch.cat((derivative, self.clock_derivative(derivative, at_clock)), dim=-1)
             names, at = [*names, CLOCK, CLOCK_RATE], [*at, *clock]
         displacement = derivative[0].mT.cpu().numpy()
-        return {"unknown_names": np.array(names), "unknown_displacement": displacement, "unknown_at": np.array(at)}
+        told = {"unknown_names": np.array(names), "unknown_displacement": displacement, "unknown_at": np.array(at)}
+        if bool(self.stated_sigma.isnan().all()):
+            return told
+        clocks = len(names) - len(self.columns)
+        return told | {"unknown_sigma": np.append(self.stated_sigma.cpu().numpy(), np.full(clocks, np.nan))}
 
 
 class FileUnknowns(OffsetUnknowns):
@@ -149,6 +158,8 @@ class FileUnknowns(OffsetUnknowns):
         self.laparoscope_joints = arms.count(arms[0]) if both else 0
         self.has_clock = CLOCK in names
         self._joint, self._joint_at = effect[..., joints], at[joints]
+        sigma = torch.full_like(at, torch.nan) if observations.unknown_sigma is None else observations.unknown_sigma
+        self.stated_sigma = torch.as_tensor(sigma, device=device)[joints]
         self._clock_at, self._clock = at.new_zeros(2), torch.zeros_like(effect[..., :1]).repeat(1, 1, 2)
         for index, name in enumerate(CLOCKS):  # files of before tell no rate
             if name in names:

@@ -306,9 +306,6 @@ def _nuisances(fit: MapEstimate, settings: SolverSettings) -> dict[str, Nuisance
                 fit.covariance[:, part, part], fit.model.layout.sigma[:, part], settings.unknowns.held_ratio
             ),
             pull=deviation[:, part] / fit.model.layout.sigma[:, part],
-            log_odds_nominal=_log_odds_nominal(
-                deviation[:, part], fit.covariance[:, part, part], fit.model.layout.sigma[:, part]
-            ),
         )
     return out
 
@@ -328,21 +325,6 @@ def _unseen(
 
 def _in_prior_units(covariance: Float[Tensor, "b k k"], prior_sigma: Float[Tensor, "b k"]) -> Float[Tensor, "b k k"]:
     return covariance / (prior_sigma[:, :, None] * prior_sigma[:, None])
-
-
-def _log_odds_nominal(
-    deviation: Float[Tensor, "b k"], covariance: Float[Tensor, "b k k"], prior_sigma: Float[Tensor, "b k"]
-) -> Float[Tensor, " b"]:
-    """Log of the Bayes factor for "exactly nominal" against "anywhere within the prior".
-
-    It is the posterior's density at the nominal values over the prior's (Dickey & Lientz 1970). In units of the prior,
-    a direction of posterior variance p in which the estimate is at x adds -(log p + x^2 / p) / 2: one that the data do
-    not see adds nothing, one that they see and find nominal speaks for "nominal".
-    """
-    values, vectors = torch.linalg.eigh(torch.nan_to_num(_in_prior_units(covariance, prior_sigma)))
-    along = (vectors.mT @ (deviation / prior_sigma)[..., None])[..., 0]
-    p = values.clamp(1e-12, 1.0)
-    return -0.5 * (p.log() + along.square() / p).sum(-1)
 
 
 def _observability(
