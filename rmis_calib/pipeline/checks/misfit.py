@@ -35,6 +35,10 @@ _LEAST = 8
 """Fewest motions that causes are told from."""
 VELOCITY_STEP_S = 0.01
 """Time from which the velocity of the shaft in the picture is told."""
+MOST_CAUSES = 3
+"""Causes named of failed tests."""
+_LIKELY, _THEN = ". Likely: ", "; then: "
+_OTHERWISE = "a joint's sign, unit or order, the base of an arm, or a joint log of another recording"
 _TELLING = (SolveStatus.CONVERGED, SolveStatus.SINGULAR, SolveStatus.NON_FINITE)
 """How a solve can end that says nothing against the model by itself."""
 
@@ -52,29 +56,62 @@ def with_misfit_named(
     result, solution = run.result, run.solution
     if solution is None or result.camera_right_T_arm is None or result.trustworthy:
         return run
-    if SolveStatus(int(solution.status)) in _TELLING and not is_misfit(result):
+    misfit = SolveStatus(int(solution.status)) not in _TELLING or is_misfit(result)
+    if not misfit and (result.tests is None or not result.tests.failed):
         return run
-    kept = run
-    if any(any(result.intrinsic_correction(view.side)) for view in run.views):
+    causes = _shown(run)
+    if misfit:
+        causes = [*causes, *_traces(run, config, plainly)] or [_OTHERWISE]
+        message = misfit_message(result, causes)
+    else:
+        causes = [*causes, *(() if result.tests is None else result.tests.causes)][:MOST_CAUSES]
+        message = f"{result.message.partition(_LIKELY)[0]}{_LIKELY}{_THEN.join(causes)}"
+    tests = None if result.tests is None else replace(result.tests, causes=tuple(causes))
+    return replace(run, result=replace(result, message=message, tests=tests))
+
+
+def _traces(run: CalibrationRun, config: CalibrationConfig, plainly: Callable[[], CalibrationRun]) -> list[str]:
+    """Causes that leave a trace in the residuals; arguments as for `with_misfit_named`."""
+    if any(any(run.result.intrinsic_correction(view.side)) for view in run.views):
         plain = plainly()
-        run = kept if plain.solution is None or plain.result.camera_right_T_arm is None else plain
+        run = run if plain.solution is None or plain.result.camera_right_T_arm is None else plain
     unknowns = KinematicUnknowns(run.recording, run.poses.frames, config.device)
-    found = [view.at(run.poses.frames) for view in run.views]
     moved = None
     if unknowns.has_clock:
         at = poses_at_motions(unknowns, run.poses, run.result.kinematic_offsets, VELOCITY_STEP_S)
         moved = replace(run, poses=at)
     parts = []
-    for view, detections, choice in zip(run.views, found, run.choices, strict=True):
+    for view, choice in zip(run.views, run.choices, strict=True):
         now = run.predicted_contours(view)
         if now is not None and view.camera is not None:
             later = None if moved is None else moved.predicted_contours(view)
             off = run.result.intrinsic_correction(view.side)
-            parts.append(signed_residuals(detections, choice, now, later, VELOCITY_STEP_S, view.camera, off))
+            found = view.at(run.poses.frames)
+            parts.append(signed_residuals(found, choice, now, later, VELOCITY_STEP_S, view.camera, off))
+    return traces(joined_residuals(parts)) if parts else []
+
+
+def _shown(run: CalibrationRun) -> list[str]:
+    """Causes that the pictures show whatever the estimate is."""
+    found = [view.at(run.poses.frames) for view in run.views]
     depth = median_inverse_depth(run.recording.stereo.camera_left_T_camera_right, found, run.choices)
-    repeated = sum(reason == FrameReason.REPEATED.sentence for reason in result.motions.reasons)
-    causes = likely_causes(joined_residuals(parts), depth, repeated) if parts else []
-    return replace(kept, result=replace(result, message=misfit_message(result, causes)))
+    repeated = sum(reason == FrameReason.REPEATED.sentence for reason in run.result.motions.reasons)
+    return shown_causes(depth, repeated)
+
+
+def shown_causes(inverse_depth: float | None, repeated: int) -> list[str]:
+    """The same in words.
+
+    Args:
+        inverse_depth: of the shaft in both cameras (`median_inverse_depth`), 1/mm; None where they do not tell it.
+        repeated: pictures that repeat the one before although the joints moved.
+    """
+    causes = []
+    if repeated:
+        causes.append(f"{repeated} pictures repeat the one before (a frame grabber that stalls)")
+    if looks_swapped(inverse_depth):
+        causes.append("the left and the right pictures look swapped")
+    return causes
 
 
 def misfit_message(result: CalibrationResult, causes: list[str]) -> str:
@@ -84,9 +121,9 @@ def misfit_message(result: CalibrationResult, causes: list[str]) -> str:
     size = ""
     if mm > TOO_NOISY[_MM] or rad > TOO_NOISY[_RAD]:
         size = f" (as if the joints were noisy by {mm:.2g} mm and {np.rad2deg(rad):.2g} deg)"
-    likely = "; then: ".join(causes)
+    likely = _THEN.join(causes)
     head, _, rest = result.message.partition(": ")
-    rest = rest.partition(": are the cameras swapped")[0]
+    rest = rest.partition(": are the cameras swapped")[0].partition(_LIKELY)[0]
     return f"{head}: pictures and joints do not fit each other{size}. Likely: {likely}. ({rest})"
 
 
@@ -114,19 +151,10 @@ def is_misfit(result: CalibrationResult) -> bool:
     return contradicting > int(result.motions.used.sum())
 
 
-def likely_causes(residuals: SignedResiduals, inverse_depth: float | None, repeated: int) -> list[str]:
-    """Causes in words, the most likely first.
-
-    Args:
-        residuals: of all motions and cameras that measured the shaft.
-        inverse_depth: of the shaft in both cameras (`median_inverse_depth`), 1/mm; None where they do not tell it.
-        repeated: pictures that repeat the one before although the joints moved.
-    """
+def traces(residuals: SignedResiduals) -> list[str]:
+    """Causes that leave a trace in the residuals of all motions and cameras that measured the shaft, in words, the most
+    likely first."""
     causes = []
-    if repeated:
-        causes.append(f"{repeated} pictures repeat the one before (a frame grabber that stalls)")
-    if looks_swapped(inverse_depth):
-        causes.append("the left and the right pictures look swapped")
     u, v = residuals.uv.T
     by = {
         "the clock or the frame rate: residuals grow with the speed of the shaft in the picture": (
@@ -145,7 +173,7 @@ def likely_causes(residuals: SignedResiduals, inverse_depth: float | None, repea
             break
         causes.append(best)
         del by[best]
-    return causes or ["a joint's sign, unit or order, the base of an arm, or a joint log of another recording"]
+    return causes
 
 
 def signed_residuals(

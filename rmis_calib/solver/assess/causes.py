@@ -3,7 +3,8 @@
 Each cause has columns: what a unit of it would do to every row. With u their score and A their information, the
 parameters of the fit eliminated, freeing the cause would lower chi^2 by u^T A^-1 u (Rao 1948); the more columns, the
 less that means (Schwarz 1978: each costs the logarithm of the number of places). What an unknown of the fit already
-took, within its prior, counts for its cause: a lens that is pulled from its nominal value is not exonerated by fitting.
+took counts for its cause, in sigmas of its prior: a lens that is pulled from its nominal value is not exonerated by
+fitting.
 """
 
 import torch
@@ -59,15 +60,12 @@ def causes_of(
         gain, freedom = _gain(sums, H, part)
         found[name] = gain * step / excess - freedom * price
     for name, index in _fitted(model).items():
-        deviation = fit.model.layout.prior(fit.state)[0][:, index]
-        C = fit.covariance[:, index][:, :, index]
-        taken = (deviation * torch.linalg.solve_ex(C, deviation[..., None]).result[..., 0]).sum(-1)
-        found[name] = found[name] + torch.nan_to_num(taken).clamp_min(0.0) / excess
-    inflation = groups.inflation.square()
+        deviation, weight = (x[:, index] for x in fit.model.layout.prior(fit.state))
+        found[name] = found[name] + torch.nan_to_num(weight * deviation.square()).sum(-1)
     if groups.count:
-        found["camera moved"] = groups.change_sigmas.square() * inflation - 7.0 * price
+        found["camera moved"] = groups.change_sigmas.square() - 7.0 * price
     if jump is not None:
-        found["clock jump"] = jump.sigmas.square() * inflation - 2.0 * price
+        found["clock jump"] = jump.sigmas.square() - 2.0 * price
     return found
 
 
