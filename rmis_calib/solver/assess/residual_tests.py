@@ -49,8 +49,8 @@ from rmis_calib.solver.test_list import (
 )
 
 TESTED_MOTIONS = 640
-"""Long recordings are tested on a sample, evenly in time: it shows a fifth of the noise of one motion, and takes a part of
-the time of the solve."""
+"""Long recordings are tested on a sample, evenly in time: it shows a fifth of the noise of one motion, and takes a
+small part of the time of the solve."""
 SIMULATIONS = 4
 """Antithetic pairs of every motion, of trials where some test fails."""
 PAIRED_PLACES = 384
