@@ -109,7 +109,8 @@ def _with_looks(
 ) -> tuple[ShaftDetections, int]:
     """The detections of all frames with those of the wanted motions, and of how many motions there are such."""
     detector = ShaftDetector(config.detector, view.camera)
-    searched = view.detections.reason != FrameReason.LEFT_OUT
+    not_to_be_used = view.detections.reason.new_tensor([FrameReason.LEFT_OUT, FrameReason.REPEATED])
+    searched = ~torch.isin(view.detections.reason, not_to_be_used)
     motions = [m for m in wanted.nonzero()[:, 0].tolist() if searched[run.poses.frames[m]]]
     if not motions:
         return view.detections, 0
