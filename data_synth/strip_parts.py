@@ -12,6 +12,9 @@ LENGTH = 1e3
 """The tube begins so far before its end."""
 LEAST_STEP = 0.07
 """What follows the tube differs from it by so much in some colour: an end that nobody sees has no place."""
+LEAST_TO_END = -2.5
+"""In widths of the tube: what is fixed on a tube ends before this. A band nearer to the end looks like a ring, and what
+is beyond it like the wrist's base, which often has the tube's own colour."""
 
 
 class Draw:
@@ -212,5 +215,5 @@ def _around(draw: Draw, s_first: Tensor, tube: Tensor) -> list[dict[str, Tensor]
             | {"present": (taped & draw.chance(0.7)).float()}
         )  # fmt: skip
     for part in parts:  # what reaches the end would hide it
-        part["present"] = part["present"] * (part["s_to"] < -0.9)
+        part["present"] = part["present"] * (part["s_to"] < LEAST_TO_END)
     return parts

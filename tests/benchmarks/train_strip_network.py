@@ -7,8 +7,7 @@ presets, some of benches with clutter, and painted ones (data_synth/strips.py), 
 differ in each. The same settings give the same weights, bit for bit on one machine. Prints what the network says of
 pictures that it was not trained on, presets among them that it never saw.
 
-The weights in the package are those of an earlier version (36 scenes and 1,190 benches; four more passes in two orders,
-averaged), which no seed gives again; docs/accuracy.md compares both.
+The weights in the package are this version's with its default settings; docs/accuracy.md says how good they are.
 """
 
 import argparse
@@ -37,7 +36,7 @@ from torch import Tensor
 from rmis_calib.vision.coarse.straight_pictures import ALONG
 from rmis_calib.vision.coarse.strip_network import KINDS, StripNetwork, load_network, save_weights
 
-VERSION = 2
+VERSION = 3
 """Raised with every change here, in labelled_strips.py or in data_synth that changes the weights."""
 
 
