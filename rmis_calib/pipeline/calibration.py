@@ -133,7 +133,7 @@ def calibrate_views(
     run, about_rows = _with_rows_at_one_instant(run, draft, progress)
     run = _with_joint_offsets(run, config, progress)
     progress("checking", 0, 1)
-    run = with_misfit_named(run, config, lambda: _with_cameras_as_given(run, config))
+    run = with_misfit_named(run, config, lambda: _with_cameras_as_given(run, config), lambda: _with_clock(run, config))
     run = run.with_notes((*recording.notes, *notes, *looks, *about_rows))
     run = with_next_motions(run, config)
     progress("checking", 1, 1)
@@ -272,6 +272,13 @@ def _with_cameras_as_given(run: CalibrationRun, config: CalibrationConfig) -> Ca
     unknowns = replace(config.solver.unknowns, intrinsics=False)
     plain = replace(config, solver=replace(config.solver, unknowns=unknowns))
     return _solve_again(run, plain, run.choices, no_progress)
+
+
+def _with_clock(run: CalibrationRun, config: CalibrationConfig) -> CalibrationRun:
+    """The same choice solved with the clock among the unknowns, wherever it may be."""
+    unknowns = replace(config.solver.unknowns, clock=True)
+    free = replace(config, solver=replace(config.solver, unknowns=unknowns))
+    return _solve(run.recording, free, run.views, run.told, run.choices, no_progress)
 
 
 def _solve_again(

@@ -5,6 +5,7 @@ import pickle
 import signal
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -110,8 +111,9 @@ def test_killed_it_is_started_again_and_asked_again(pictures: torch.Tensor, monk
 def processes() -> set[int]:
     """Processes that this one has started and that are at work."""
     found = set()
-    for path in Path("/proc/self/task").iterdir():
-        for pid in (path / "children").read_text().split():
-            if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes():  # empty of a dead one
-                found.add(int(pid))
+    for task in Path("/proc/self/task").iterdir():
+        with suppress(FileNotFoundError, ProcessLookupError):  # a thread that has ended, or a process
+            for pid in (task / "children").read_text().split():
+                if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes():  # empty of a dead one
+                    found.add(int(pid))
     return found

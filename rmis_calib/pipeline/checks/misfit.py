@@ -44,7 +44,10 @@ _TELLING = (SolveStatus.CONVERGED, SolveStatus.SINGULAR, SolveStatus.NON_FINITE)
 
 
 def with_misfit_named(
-    run: CalibrationRun, config: CalibrationConfig, plainly: Callable[[], CalibrationRun]
+    run: CalibrationRun,
+    config: CalibrationConfig,
+    plainly: Callable[[], CalibrationRun],
+    with_clock: Callable[[], CalibrationRun],
 ) -> CalibrationRun:
     """The run; a result that is not trustworthy as pictures and joints do not fit says so first, with the causes.
 
@@ -52,6 +55,7 @@ def with_misfit_named(
         run: to look at.
         config: of the calibration.
         plainly: solves the same with the cameras as given: where nothing fits, corrections of cameras hide the cause.
+        with_clock: solves the same with the clock as an unknown.
     """
     result, solution = run.result, run.solution
     if solution is None or result.camera_right_T_arm is None or result.trustworthy:
@@ -61,13 +65,24 @@ def with_misfit_named(
         return run
     causes = _shown(run)
     if misfit:
-        causes = [*causes, *_traces(run, config, plainly)] or [_OTHERWISE]
+        causes = [*causes, *_of_clock(config, with_clock)] or _traces(run, config, plainly) or [_OTHERWISE]
         message = misfit_message(result, causes)
     else:
         causes = [*causes, *(() if result.tests is None else result.tests.causes)][:MOST_CAUSES]
         message = f"{result.message.partition(_LIKELY)[0]}{_LIKELY}{_THEN.join(causes)}"
     tests = None if result.tests is None else replace(result.tests, causes=tuple(causes))
     return replace(run, result=replace(result, message=message, tests=tests))
+
+
+def _of_clock(config: CalibrationConfig, with_clock: Callable[[], CalibrationRun]) -> list[str]:
+    """That another clock makes everything fit, where the clock is no unknown so far: the surest trace of it."""
+    if config.solver.unknowns.clock:
+        return []
+    run = with_clock()
+    if run.solution is None or int(run.solution.status) != SolveStatus.CONVERGED or is_misfit(run.result):
+        return []
+    offset_s = run.result.kinematic_offsets.clock[0]
+    return [f"the clock or the frame rate: with the clock moved by {offset_s:+.3f} s they fit"]
 
 
 def _traces(run: CalibrationRun, config: CalibrationConfig, plainly: Callable[[], CalibrationRun]) -> list[str]:

@@ -8,7 +8,8 @@ where the model is right. The variance is not below what the scatter over places
 2015): motions at one place share their error of the kinematics and count as one, and the reference is Student's t with
 as many degrees of freedom as there are places, less one.
 
-Neighbours: e_i is the residual of place i in its own sigma; sum e_i e_j over pairs has the variance sum e_i^2 e_j^2.
+Neighbours: e_i is the residual of place i in its own sigma; sum e_i e_j over pairs has the variance sum e_i^2 e_j^2,
+and not below the number of pairs.
 
 Beside these stand the tests that compare answers: of two halves of the motions, of what comes before and after
 (groups.py), and the clock before and after (clock_jump.py).
@@ -260,7 +261,8 @@ class Places:
         e, C = self.e, self.covariance
         products = e[..., 1:] * e[..., :-1]
         expected = -torch.einsum("mbgp,bpq,mbgq->mb", self.effect[..., 1:, :], C, self.effect[..., :-1, :])
-        return (products.sum(-1) - expected) / products.square().sum(-1).clamp_min(1e-12).sqrt()
+        pairs = (self.known[..., 1:] * self.known[..., :-1]).sum(-1)
+        return self._in_sigmas(products.sum(-1) - expected, products.square().sum(-1), pairs)
 
     def against_nearest(self) -> Float[Tensor, "m b"]:
         """The same between each place and the nearest one that does not come just before or after it."""
@@ -278,7 +280,17 @@ class Places:
         variance = 0.5 * (squares[..., None, :] @ pair @ squares[..., None])[..., 0, 0]
         partner = pair @ effect  # (m, b, g, p): of all partners
         expected = -0.5 * torch.einsum("mbgp,bpq,mbgq->mb", effect, self.covariance, partner)
-        return (products - expected) / variance.clamp_min(1e-12).sqrt()
+        known = self.known[..., ::step]
+        pairs = 0.5 * (known[..., None, :] @ pair @ known[..., None])[..., 0, 0]
+        return self._in_sigmas(products - expected, variance, pairs)
+
+    def _in_sigmas(
+        self, excess: Float[Tensor, "m b"], squares: Float[Tensor, "m b"], pairs: Float[Tensor, "m b"]
+    ) -> Float[Tensor, "m b"]:
+        """A sum of products less what is expected of it, in its sigma: not below that of the noise as fitted, with
+        which the expected goes, and which a few outliers raise far above all other residuals."""
+        is_scaled = self.covariance.shape[-1] > 0  # else the noise is known to a factor only
+        return excess / (torch.maximum(squares, pairs) if is_scaled else squares).clamp_min(1e-12).sqrt()
 
 
 def _t_tail(statistic: Float[Tensor, "*a"], freedom: Float[Tensor, "*a"]) -> Float[Tensor, "*a"]:

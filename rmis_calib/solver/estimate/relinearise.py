@@ -43,13 +43,17 @@ def scan_clock(
     """The candidate clock (offset and rate) at which lines and joints agree best, and the score of each (mean squared
     sine).
 
-    Candidates at which fewer than half as many motions are valid as at the best covered one do not compete.
+    Candidates at which fewer than half as many motions are valid as at the best covered one do not compete. Motions
+    that a candidate loses count as if they agreed as well as they do at the typical one: a few always agree.
     """
     problem = kinematics(clocks.new_zeros(clocks.shape[0], joints), clocks)
     statistics = LineStatistics.from_problem(problem)
     count = statistics.count.sum(-1)
     score = find_candidates(statistics, SCAN_GRID, 2).score.amin(-1)
-    score = torch.where(count >= 0.5 * count.amax(), score, torch.inf)
+    share = count / count.amax().clamp_min(1.0)
+    competes = share >= 0.5
+    score = share * score + (1.0 - share) * score[competes].median()
+    score = torch.where(competes, score, torch.inf)
     return clocks[score.argmin()], score
 
 

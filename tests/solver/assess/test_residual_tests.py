@@ -82,6 +82,18 @@ def test_errors_that_neighbours_in_time_share_are_told() -> None:
     )
 
 
+def test_noise_below_what_is_stated_does_not_make_neighbours_alike() -> None:
+    """What the fit takes of the residuals goes with the stated noise, their products with the real one: a tenth."""
+    arrays = scene(30, 40)
+    stated = {key: 10.0 * arrays[key] for key in arrays if key.startswith(("sigma_image", "sigma_kinematics"))}
+    settings = parse_config({"solver": {"groups": 8, "noise": {"estimate": "never"}}}).solver
+    tests = solve(Problem.from_arrays(arrays | stated).only("axis", "contours", "ends"), settings).tests
+    assert len(stated) == 3 and tests is not None
+    for index, name in enumerate(tests.names):
+        if name.over.startswith("neighbours"):
+            assert not bool(tests.failed[:, index].any()), name
+
+
 def test_motions_at_one_place_count_as_one() -> None:
     """10 stops of 12 frames share their errors of the kinematics: told once, they are no evidence."""
     arrays = scene(30)
