@@ -208,7 +208,8 @@ class ResidualTest:
     probability: Number
     """That some test of the whole list does as badly though the model is right (corrected for their number)."""
     failed: bool
-    """Whether it takes the status `ok` away."""
+    """Whether it takes the status `ok` away: where `probability` is below the level, but for tests of neighbours, whose
+    common errors the sigmas count."""
     before_motion: int | None
     """Index of the first motion after the step; null for other tests."""
     words: str

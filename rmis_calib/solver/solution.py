@@ -248,7 +248,7 @@ class Solution:
         """Codes of `Verdict`; a solve that did not converge is never better than unobservable."""
         verdict = self.observability.verdict.view_as(self.status)
         if self.tests is not None:
-            failed = self.tests.failed.any(-1).view_as(verdict)
+            failed = self.tests.against.any(-1).view_as(verdict)
             verdict = torch.where(failed, verdict.clamp_min(Verdict.WEAK.code), verdict)
         return torch.where(self.converged, verdict, Verdict.UNOBSERVABLE.code)
 

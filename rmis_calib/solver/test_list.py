@@ -94,6 +94,16 @@ class TestList:
         """Which tests fail."""
         return self.corrected < LEVEL
 
+    @property
+    def against(self) -> Bool[Tensor, "b m"]:
+        """Which tests that fail speak against the answer. Neighbours whose errors are alike do not by themselves:
+        pictures that follow each other share what misleads the detector, and leaving out groups of neighbours
+        (groups.py) measures what that does to the answer."""
+        of_neighbours = torch.tensor(
+            [name.over in (NEAR_IN_TIME, NEAR_IN_JOINTS) for name in self.names], dtype=torch.bool
+        )
+        return self.failed & ~of_neighbours.to(self.chance.device)
+
     def fails(self, kind: str, over: str) -> Bool[Tensor, " b"]:
         """Whether one test fails; False where it is not in the list."""
         place = {name: index for index, name in enumerate(self.names)}.get(TestName(kind, over))

@@ -17,7 +17,7 @@ from rmis_calib.pipeline.answer.setup_record import (
     instrument_base_of,
     setup_of,
 )
-from rmis_calib.pipeline.answer.tests_in_words import told_tests
+from rmis_calib.pipeline.answer.tests_in_words import about_neighbours, told_tests
 from rmis_calib.pipeline.arms.poses import MotionPoses
 from rmis_calib.pipeline.motions.association import Choice
 from rmis_calib.pipeline.motions.observations import reasons_for
@@ -82,6 +82,7 @@ def make_result(
         *_about_tool(solution),
         *about_ends(solution),
         *about_groups(consistency, names),
+        *about_neighbours(tests),
         *about_cameras(solution),
         *about_setup(solution, frame, config.solver.unknowns),
         *about_compliance(solution),

@@ -63,7 +63,7 @@ def told_tests(solution: Solution, columns: tuple[str, ...] = (), names: MotionN
     if found is None:
         return None
     rows = zip(
-        found.names, *(x[0].tolist() for x in (found.statistic, found.corrected, found.failed, found.at)), strict=True
+        found.names, *(x[0].tolist() for x in (found.statistic, found.corrected, found.against, found.at)), strict=True
     )
     tests = []
     for name, statistic, probability, failed, at in rows:
@@ -75,8 +75,19 @@ def told_tests(solution: Solution, columns: tuple[str, ...] = (), names: MotionN
         before = at if at >= 0 else None
         tests.append(ResidualTest(name.kind, over, statistic, probability, failed, before, words))
     tests.sort(key=lambda test: (not test.failed, test.probability, -abs(test.statistic or 0.0)))
-    causes = tuple(causes_in_words(solution, names)) if bool(found.failed.any()) else ()
+    causes = tuple(causes_in_words(solution, names)) if bool(found.against.any()) else ()
     return Tests(LEVEL, tuple(tests), causes)
+
+
+def about_neighbours(tests: Tests | None) -> tuple[str, ...]:
+    """The clearest test of neighbours that fails, in words: their common errors are in the sigmas."""
+    if tests is None:
+        return ()
+    for test in tests.tests:
+        if test.over in (NEAR_IN_TIME, NEAR_IN_JOINTS) and (test.probability or 0.0) < LEVEL:
+            words = f"{test.words[:1].upper()}{test.words[1:]} ({test.statistic:+.1f} sigmas)"
+            return (f"{words}: sigmas count such motions together.",)
+    return ()
 
 
 def causes_in_words(solution: Solution, names: MotionNames = NUMBERED) -> list[str]:

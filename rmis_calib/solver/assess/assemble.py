@@ -125,7 +125,7 @@ def joint_solution(
     C = groups.grown(C)
     jump = find_clock_jump(fit, excess, groups)
     tests = answer_tests(groups, jump, measured.motions).joined(fit_tests(fit, settings))
-    causes = causes_of(fit, groups, jump, excess) if bool(tests.failed.any()) else {}
+    causes = causes_of(fit, groups, jump, excess) if bool(tests.against.any()) else {}
     setup = _setup(fit, excess, groups, evidence)
     for name in evidence.doubt.keys() - {"setup"}:
         C = C + evidence.doubt[name][:, :6, :6]

@@ -7,6 +7,8 @@ import torch
 from data_synth.lines import simulate_lines
 from data_synth.settings import LineStudyConfig
 from rmis_calib.config import parse_config
+from rmis_calib.pipeline.answer.tests_in_words import about_neighbours
+from rmis_calib.results import ResidualTest, Tests
 from rmis_calib.solver import Problem, Solution, solve
 from rmis_calib.solver.assess.residual_tests import residual_tests
 from rmis_calib.solver.assess.tested_over import over_of_solution
@@ -134,3 +136,23 @@ def test_further_residuals_join_the_list() -> None:
         joined.fails("profile_left", "angle 1").all()
     )
     assert len(joined.names) > len(tests.names) and joined.corrected.shape == (3, len(joined.names))
+
+
+def test_neighbours_alone_do_not_take_ok_away_and_are_said() -> None:
+    names = (TestName("taper_right", "neighbours in time"), TestName("taper_right", "mean"))
+    chance = torch.tensor([[1e-6, 0.5], [0.5, 1e-6]], dtype=torch.float64)
+    tests = TestList(names, torch.full_like(chance, 4.8), chance, torch.full((2, 2), -1))
+    assert tests.failed.tolist() == [[True, False], [False, True]]
+    assert tests.against.tolist() == [[False, False], [False, True]]
+    listed = Tests(
+        LEVEL,
+        tuple(
+            ResidualTest(name.kind, name.over, 4.8, p, p < LEVEL and name.over == "mean", None, f"{name.over} in words")
+            for name, p in zip(names, chance[0].tolist(), strict=True)
+        ),
+        (),
+    )
+    assert about_neighbours(listed) == (
+        "Neighbours in time in words (+4.8 sigmas): sigmas count such motions together.",
+    )
+    assert about_neighbours(None) == ()
