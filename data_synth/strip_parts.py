@@ -191,10 +191,12 @@ def _jaws(draw: Draw, s: Tensor) -> list[dict[str, Tensor]]:
 
 def _around(draw: Draw, s_first: Tensor, tube: Tensor) -> list[dict[str, Tensor]]:
     """What may sit on the tube well before its end: tapes, a sleeve, balls as markers. The tube goes on beyond them."""
-    shaped, taped = draw.chance(0.16), draw.chance(0.18)
-    at = s_first * draw.between(0.1, 0.9)
+    shaped, taped = draw.chance(0.28), draw.chance(0.18)
     gap = draw.between(0.5, 6.0)
     ball = draw.between(1.2, 3.2)
+    # Markers are put where they stay in view: near the end as often as anywhere.
+    near = LEAST_TO_END - 0.5 * ball - draw.between(0.0, 6.0)
+    at = torch.where(draw.chance(0.5), near, s_first * draw.between(0.1, 0.9))
     both = draw.chance(0.6)
     colour, sleeve = draw_tones(draw, 0.15, 0.95, 1.0), draw_tones(draw, 0.03, 0.9, 0.5)
     ratio = draw.between(1.05, 2.0)

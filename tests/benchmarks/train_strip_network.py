@@ -36,7 +36,7 @@ from torch import Tensor
 from rmis_calib.vision.coarse.straight_pictures import ALONG
 from rmis_calib.vision.coarse.strip_network import KINDS, StripNetwork, load_network, save_weights
 
-VERSION = 3
+VERSION = 4
 """Raised with every change here, in labelled_strips.py or in data_synth that changes the weights."""
 
 
