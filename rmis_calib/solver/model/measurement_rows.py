@@ -228,7 +228,7 @@ class MeasurementRows:
 
     def with_ends_of(self, other: "MeasurementRows") -> "MeasurementRows":
         """Only those shaft ends that the other rows, of the same motions, have too, and at the same places."""
-        if not other.has_ends:
+        if not (self.has_ends and other.has_ends):
             return self.without_ends()
         return replace(self, end_ok=self.end_ok & other.end_ok, end_second=other.end_second)
 
