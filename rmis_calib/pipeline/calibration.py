@@ -192,10 +192,13 @@ def solve_choices(
 
 def _without_joint_offsets(config: CalibrationConfig) -> CalibrationConfig:
     """A shaft is told from another one well enough without asking whether the encoders have offsets."""
-    unknowns = config.solver.unknowns
-    if unknowns.joint_offsets != "auto":
-        return config
-    return replace(config, solver=replace(config.solver, unknowns=replace(unknowns, joint_offsets="never")))
+    return config if config.solver.unknowns.joint_offsets != "auto" else _asking(config, joint_offsets="never")
+
+
+def _asking(config: CalibrationConfig, **unknowns: bool | str) -> CalibrationConfig:
+    """The settings with these of its unknowns changed."""
+    asked = replace(config.solver.unknowns, **unknowns)
+    return replace(config, solver=replace(config.solver, unknowns=asked))
 
 
 def _choose_again(run: CalibrationRun, config: CalibrationConfig, several: bool, progress: Progress) -> CalibrationRun:
@@ -269,16 +272,12 @@ def _with_joint_offsets(run: CalibrationRun, config: CalibrationConfig, progress
 
 def _with_cameras_as_given(run: CalibrationRun, config: CalibrationConfig) -> CalibrationRun:
     """The same choice solved without corrections of the cameras."""
-    unknowns = replace(config.solver.unknowns, intrinsics=False)
-    plain = replace(config, solver=replace(config.solver, unknowns=unknowns))
-    return _solve_again(run, plain, run.choices, no_progress)
+    return _solve_again(run, _asking(config, intrinsics=False), run.choices, no_progress)
 
 
 def _with_clock(run: CalibrationRun, config: CalibrationConfig) -> CalibrationRun:
     """The same choice solved with the clock among the unknowns, wherever it may be."""
-    unknowns = replace(config.solver.unknowns, clock=True)
-    free = replace(config, solver=replace(config.solver, unknowns=unknowns))
-    return _solve(run.recording, free, run.views, run.told, run.choices, no_progress)
+    return _solve(run.recording, _asking(config, clock=True), run.views, run.told, run.choices, no_progress)
 
 
 def _solve_again(

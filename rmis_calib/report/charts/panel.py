@@ -11,6 +11,8 @@ from matplotlib.ticker import MaxNLocator
 
 LEFT, TOP, BOTTOM = 34.0, 8.0, 32.0
 """Room for labels, in the chart's units, which are about CSS pixels."""
+_TITLE = 18.0
+"""Room for the title above a picture."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,34 @@ class Chart:
     zero: float | None
     framed: bool
     paths: tuple[Path, ...]
+
+
+@dataclass(frozen=True)
+class PictureArea:
+    """A chart over a camera's picture.
+
+    Attributes:
+        size: (height, width) of the picture, px.
+        width: of the plotting area.
+    """
+
+    size: tuple[int, int]
+    width: float
+
+    @property
+    def scale(self) -> float:
+        """A pixel in the chart."""
+        return self.width / self.size[1]
+
+    def places(self, uv: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+        """Where pixels lie."""
+        return (uv + 0.5) * self.scale + np.array([0.5, _TITLE])
+
+    def chart(self, words: str, title: str, paths: list[Path]) -> Chart:
+        """The chart of these paths."""
+        bottom = self.size[0] * self.scale + _TITLE
+        box = (0.5, _TITLE, self.width + 0.5, bottom)
+        return Chart(words, self.width + 1.0, bottom + 1.0, box, title, "", (), (), None, True, tuple(paths))
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,11 @@ from jaxtyping import Bool, Float
 
 from rmis_calib.pipeline.answer.run import CalibrationRun
 from rmis_calib.pipeline.answer.view_edges import ViewEdges
-from rmis_calib.report.charts.panel import Chart, Path, dots, strokes
+from rmis_calib.report.charts.panel import Chart, Path, PictureArea, dots, strokes
 from rmis_calib.report.charts.residuals import drawn_points, rounded_factor
 
-_WIDTH, _TOP = 400.0, 18.0
-"""Of a chart; and room for its title."""
+_WIDTH = 400.0
+"""Of a chart."""
 _STICK = 0.03
 """Length of a stick of one robust scale, in picture widths."""
 _MOST_SCALES = 6.0
@@ -39,14 +39,14 @@ def edge_maps(run: CalibrationRun) -> tuple[EdgeMap, ...]:
 
 
 def _map(found: ViewEdges, size: tuple[int, int]) -> EdgeMap:
-    height, width = size
+    area = PictureArea(size, _WIDTH)
     px = found.px[np.isfinite(found.px)]
     spread = max(float(np.median(np.abs(px))) * 1.4826, 1e-9)
-    enlarged, scale = rounded_factor(_STICK * width / spread), _WIDTH / width
+    enlarged = rounded_factor(_STICK * size[1] / spread)
     outward = (found.right_uv[:, None] * np.array([-1.0, 1.0])[:, None])[:, :, None]  # (m, 2, 1, 2)
-    start = (found.uv + 0.5) * scale + np.array([0.5, _TOP])
+    start = area.places(found.uv)
     limit = _MOST_SCALES * spread
-    end = start + found.px.clip(-limit, limit)[..., None] * enlarged * scale * outward
+    end = start + found.px.clip(-limit, limit)[..., None] * enlarged * area.scale * outward
     kinds = {"outside": found.px > 0.0, "inside": found.px <= 0.0, "none": found.looked & ~np.isfinite(found.px)}
     paths = []
     for name, which in kinds.items():
@@ -55,20 +55,8 @@ def _map(found: ViewEdges, size: tuple[int, int]) -> EdgeMap:
             if name != "none":
                 paths.append(Path(f"stick edge-{name}", strokes(start[shown], end[shown])))
             paths.append(Path(f"foot edge-{name}", dots(*start[shown].T)))
-    chart = Chart(
-        words=f"Edges in the {found.side} pictures off the predicted contours, sticks {enlarged:g} times as long",
-        width=_WIDTH + 1.0,
-        height=height * scale + _TOP + 1.0,
-        box=(0.5, _TOP, _WIDTH + 0.5, height * scale + _TOP),
-        title=f"{found.side} pictures, × {enlarged:g}",
-        label="",
-        x_ticks=(),
-        y_ticks=(),
-        zero=None,
-        framed=True,
-        paths=tuple(paths),
-    )
-    return EdgeMap(found.side, chart, enlarged)
+    words = f"Edges in the {found.side} pictures off the predicted contours, sticks {enlarged:g} times as long"
+    return EdgeMap(found.side, area.chart(words, f"{found.side} pictures, × {enlarged:g}", paths), enlarged)
 
 
 def _some(px: Float[np.ndarray, "m 2 s"], which: Bool[np.ndarray, "m 2 s"]) -> Bool[np.ndarray, "m 2 s"]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from rmis_calib.report.charts.panel import BOTTOM, LEFT, TOP, Chart, Path, Scale, dots, range_of, strokes
+from rmis_calib.report.charts.panel import BOTTOM, LEFT, TOP, Chart, Path, PictureArea, Scale, dots, range_of, strokes
 from rmis_calib.report.charts.signed import KINDS, ResidualEvidence, SignedResiduals
 
 COLOURS = 8
@@ -114,28 +114,15 @@ def _over_picture(
     shown: SignedResiduals, size: tuple[int, int], limit: float, enlarged: float, title: str
 ) -> Chart:  # fmt: skip
     """Each residual as a stick where it was measured, across or along the shaft, in the direction of its sign."""
-    height, width = size
-    scale = _PICTURE_WIDTH / width
-    top = 18.0
-    start = (shown.uv + 0.5) * scale + np.array([0.5, top])
-    end = start + shown.px.clip(-limit, limit)[:, None] * enlarged * scale * shown.across_uv
+    area = PictureArea(size, _PICTURE_WIDTH)
+    start = area.places(shown.uv)
+    end = start + shown.px.clip(-limit, limit)[:, None] * enlarged * area.scale * shown.across_uv
     side = "left" if shown.is_left.any() else "right"
     paths = []
     for name, which in _groups(shown):
         paths += [Path(f"stick {name}", strokes(start[which], end[which])), Path(f"foot {name}", dots(*start[which].T))]
-    return Chart(
-        words=f"{title} over the {side} picture: sticks {enlarged:g} times as long as the residuals",
-        width=_PICTURE_WIDTH + 1.0,
-        height=height * scale + top + 0.5,
-        box=(0.5, top, _PICTURE_WIDTH + 0.5, height * scale + top),
-        title=f"{side} picture, × {enlarged:g}",
-        label="",
-        x_ticks=(),
-        y_ticks=(),
-        zero=None,
-        framed=True,
-        paths=tuple(paths),
-    )
+    words = f"{title} over the {side} picture: sticks {enlarged:g} times as long as the residuals"
+    return area.chart(words, f"{side} picture, × {enlarged:g}", paths)
 
 
 def _over(

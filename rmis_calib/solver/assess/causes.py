@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from rmis_calib.solver.assess.left_out import TESTED_MOTIONS, eliminated
 from rmis_calib.solver.assess.tested_over import over_of
 from rmis_calib.solver.estimate.map_estimate import MapEstimate
 from rmis_calib.solver.model.batched_linalg import batch_last, cross, dot, rotate
@@ -23,8 +24,6 @@ from rmis_calib.solver.model.residuals import linearise
 from rmis_calib.solver.model.state import State
 from rmis_calib.solver.solution import ClockJump, GroupCheck
 
-TESTED_MOTIONS = 2048
-"""Causes in long recordings are told from a sample."""
 CAUSES = ("clock", "clock jump", "camera moved", "intrinsics", "lens", "stereo", "setup", "tool", "joint_offset")
 LENGTH_MM = 100.0
 """Distance from the RCM at which the bend of a unit is one."""
@@ -44,10 +43,7 @@ def causes_of(
         jump: of the clock.
         excess: what the residuals exceed the noise by, as a factor on the variance.
     """
-    step = -(-fit.model.measured.motions // TESTED_MOTIONS)
-    model = fit.model
-    if step > 1:
-        model = model.take_motions(torch.arange(0, model.measured.motions, step, device=fit.state.t.device))
+    model, step = fit.model.sample(TESTED_MOTIONS)
     state = fit.state.moved(model.layout.step(fit.bias))
     levels = model.noise.kinematics_mm.sqrt(), model.noise.kinematics_rad.sqrt()
     places = (over_of(model.measured, levels, None).cluster[:, -1] + 1.0).clamp_min(3.0)
@@ -146,15 +142,14 @@ def _gain(
     sums: Float[Tensor, "b q q"], H: Float[Tensor, "b p p"], part: slice
 ) -> tuple[Float[Tensor, " b"], Float[Tensor, " b"]]:
     """By how much freeing the columns `part` would lower chi^2, and in how many directions they are seen."""
-    p = H.shape[-1]
-    cross_, u = sums[:, :p, part], sums[:, part, -1]
-    size = H.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
-    unit = sums[:, part, part].diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
-    scaled = cross_ * size[..., None] * unit[:, None]
-    others = H * size[:, :, None] * size[:, None] + 1e-12 * torch.eye(p, dtype=H.dtype, device=H.device)
-    taken = scaled.mT @ torch.linalg.solve_ex(others, scaled).result
-    A = sums[:, part, part] * unit[:, :, None] * unit[:, None] - taken
-    values, vectors = torch.linalg.eigh(torch.nan_to_num(0.5 * (A + A.mT)))
-    along = (vectors.mT @ torch.nan_to_num(u * unit)[..., None])[..., 0]
+    p, q, columns = H.shape[-1], part.stop - part.start, sums[:, part, part]
+    unit = columns.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
+    within = columns + torch.diag_embed(unit.square().reciprocal())  # a prior, which `eliminated` takes off again
+    top, bottom = torch.cat((H, sums[:, :p, part]), dim=-1), torch.cat((sums[:, part, :p], within), dim=-1)
+    # Where the fit is, its own score vanishes.
+    g = torch.cat((torch.zeros_like(H[:, 0]), sums[:, part, -1]), dim=-1)
+    block = eliminated(torch.cat((top, bottom), dim=-2), g, unit, [*range(p, p + q)], [*range(p)], [])
+    values, vectors = torch.linalg.eigh(block.A)
+    along = (vectors.mT @ block.u[..., None])[..., 0]
     seen = values > SEEN
-    return torch.where(seen, along.square() / values.clamp_min(SEEN), 0.0).sum(-1), seen.sum(-1).to(u)
+    return torch.where(seen, along.square() / values.clamp_min(SEEN), 0.0).sum(-1), seen.sum(-1).to(g)

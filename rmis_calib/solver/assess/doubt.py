@@ -18,10 +18,8 @@ SCALES = (0.5, 1.0, 2.0)
 SHARED_CENTRE = 2.0
 """How far the principal points of all cameras may be off alike, in the prior of each."""
 CENTRE_DOUBT = 0.8
-"""Probability, before the data speak, that they are. With one half, 88 % of trials with centres 10 px off (3.3 sigmas
-of each) and a still laparoscope are within the 95 % ellipsoid, with this 92 %."""
-
-
+"""Probability, before the data speak, that they are: of a still laparoscope the data hardly say
+(`tests/benchmarks/bench_solver_misspecified.py`, centre 10 px off)."""
 OWN_BELIEF = {"rcm_offset": 0.5, "readout": 0.5}
 """Least probability, before the data speak, that the shaft misses the RCM, and that rows are read one after the other,
 by about the prior: more than that a set-up is wrong which somebody measured. With 0.2 for the RCM, 5 % of trials with a

@@ -68,9 +68,7 @@ class Candidates:
         for name in names:
             asked = freed(asked, name)
         layout = make_layout(nominal, model.measured, model.layout.origin, asked, settings.noise)
-        step = -(-model.measured.motions // TESTED_MOTIONS)
-        if step > 1:
-            model = model.take_motions(torch.arange(0, model.measured.motions, step, device=fit.state.t.device))
+        model, _ = model.sample(TESTED_MOTIONS)
         normal = accumulate(replace(model, layout=layout), fit.state)
         H, g = torch.nan_to_num(normal.H), torch.nan_to_num(normal.g)
         left_out = {place for name in names for place in places(layout, name)}

@@ -98,9 +98,9 @@ def fit_tests(fit: MapEstimate, settings: SolverSettings) -> TestList:
     # Where they fit best, residuals are what the model says; without its bias the estimate fits a little worse.
     state = fit.state.moved(model.layout.step(fit.bias))
     motions = model.measured.motions
-    number = torch.arange(0, motions, -(-motions // TESTED_MOTIONS), device=state.t.device)
-    if len(number) < motions:
-        model, joints = model.take_motions(number), None if joints is None else joints[:, number]
+    model, step = model.sample(TESTED_MOTIONS)
+    number = torch.arange(0, motions, step, device=state.t.device)
+    joints = None if joints is None else joints[:, ::step]
     levels = model.noise.kinematics_mm.sqrt(), model.noise.kinematics_rad.sqrt()
     residuals, over = residuals_of(model, state), over_of(model.measured, levels, joints, number, motions)
     prior = torch.diag_embed(model.layout.sigma.square().reciprocal())
@@ -288,7 +288,7 @@ class Places:
         self, excess: Float[Tensor, "m b"], squares: Float[Tensor, "m b"], pairs: Float[Tensor, "m b"]
     ) -> Float[Tensor, "m b"]:
         """A sum of products less what is expected of it, in its sigma: not below that of the noise as fitted, with
-        which the expected goes, and which a few outliers raise far above all other residuals."""
+        which the expected goes, and which may lie far above most residuals."""
         is_scaled = self.covariance.shape[-1] > 0  # else the noise is known to a factor only
         return excess / (torch.maximum(squares, pairs) if is_scaled else squares).clamp_min(1e-12).sqrt()
 

@@ -85,6 +85,14 @@ class WeightedModel:
         weight = None if self.weight is None else self.weight[..., index]
         return replace(self, measured=self.measured.take_motions(index), weight=weight)
 
+    def sample(self, most: int) -> tuple["WeightedModel", int]:
+        """Every k-th motion, `most` of them or fewer, and k."""
+        motions = self.measured.motions
+        step = max(1, -(-motions // most))
+        return (
+            self if step == 1 else self.take_motions(torch.arange(0, motions, step, device=self.measured.p.device))
+        ), step
+
     def take_trials(self, index: Tensor) -> "WeightedModel":
         """The trials `index`, in this order, repeated where it repeats them."""
         weight = None if self.weight is None else self.weight.index_select(1, index)
