@@ -109,7 +109,7 @@ def serve(address: str, device: str, most_frames: int, threads: int) -> None:
     prefer_to_kill()
     torch.set_num_threads(threads)
     line = _Line(most_frames)
-    with detecting_threads(device) as (executor, count), Listener(address, authkey=_key()) as listener:
+    with detecting_threads(device) as (executor, count), Listener(address, authkey=key_of_batch()) as listener:
         for _ in range(count):
             executor.submit(_detect_forever, line, device)
         while True:
@@ -230,6 +230,6 @@ def device_services(devices: Sequence[str], most_frames: int, threads: int) -> I
         yield addresses
 
 
-def _key() -> bytes:
+def key_of_batch() -> bytes:
     """Shared by all processes of a batch, and by nobody else."""
     return bytes(multiprocessing.current_process().authkey)

@@ -1,7 +1,6 @@
 """A detector that has its pictures searched by the process that owns the device (`device_service.py`)."""
 
 import mmap
-import multiprocessing
 import os
 import pickle
 import tempfile
@@ -16,7 +15,7 @@ from torch import Tensor
 
 from rmis_calib.errors import DeviceError, ShapeError
 from rmis_calib.geometry import Camera
-from rmis_calib.parallel.device_service import Header
+from rmis_calib.parallel.device_service import Header, key_of_batch
 from rmis_calib.vision import DetectorSettings, ShaftDetections, ShaftDetector
 
 _ATTEMPTS = 3
@@ -131,7 +130,7 @@ def _connected(address: str) -> Connection:
     until = time.monotonic() + _PATIENCE_S
     while True:
         try:
-            return Client(address, authkey=bytes(multiprocessing.current_process().authkey))  # type: ignore[return-value]
+            return Client(address, authkey=key_of_batch())  # type: ignore[return-value]
         except (OSError, EOFError):
             if time.monotonic() > until:
                 raise

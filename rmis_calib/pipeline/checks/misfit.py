@@ -65,11 +65,12 @@ def with_misfit_named(
         return run
     causes = _shown(run)
     if misfit:
-        causes = [*causes, *_of_clock(config, with_clock)] or _traces(run, config, plainly) or [_OTHERWISE]
+        causes = [*causes, *(_of_clock(config, with_clock) or _traces(run, config, plainly))] or [_OTHERWISE]
         message = misfit_message(result, causes)
     else:
         causes = [*causes, *(() if result.tests is None else result.tests.causes)][:MOST_CAUSES]
-        message = f"{result.message.partition(_LIKELY)[0]}{_LIKELY}{_THEN.join(causes)}"
+        head = result.message.partition(_LIKELY)[0]
+        message = f"{head}{_LIKELY.lstrip('.') if head.endswith('?') else _LIKELY}{_THEN.join(causes)}"
     tests = None if result.tests is None else replace(result.tests, causes=tuple(causes))
     return replace(run, result=replace(result, message=message, tests=tests))
 
