@@ -258,37 +258,43 @@ class Places:
 
     def against_next(self) -> Float[Tensor, "m b"]:
         """Autocorrelation between places that follow each other, in its sigma."""
-        e, C = self.e, self.covariance
-        products = e[..., 1:] * e[..., :-1]
-        expected = -torch.einsum("mbgp,bpq,mbgq->mb", self.effect[..., 1:, :], C, self.effect[..., :-1, :])
-        pairs = (self.known[..., 1:] * self.known[..., :-1]).sum(-1)
-        return self._in_sigmas(products.sum(-1) - expected, products.square().sum(-1), pairs)
+        one, other = (
+            (self.e[..., part], self.effect[..., part, :], self.known[..., part])
+            for part in (slice(1, None), slice(None, -1))
+        )
+        return self._alike(one, other, torch.ones_like(self.e[0, :, 1:]))
 
     def against_nearest(self) -> Float[Tensor, "m b"]:
         """The same between each place and the nearest one that does not come just before or after it."""
         step = -(-self.where.shape[1] // PAIRED_PLACES)
-        e, effect, where = self.e[..., ::step], self.effect[..., ::step, :], self.where[:, ::step]
-        g = where.shape[1]
-        distance = torch.cdist(where, where)
-        number = torch.arange(g, device=where.device)
+        where, one = self.where[:, ::step], (self.e[..., ::step], self.effect[..., ::step, :], self.known[..., ::step])
+        number = torch.arange(where.shape[1], device=where.device)
         close = (number[:, None] - number).abs() * step < APART_IN_TIME
-        nearest = torch.where(close, torch.inf, distance).argmin(-1)
-        pair = torch.nn.functional.one_hot(nearest, g).to(e)
-        pair = torch.maximum(pair, pair.mT)  # (b, g, g): a pair of two that are nearest to each other is one
-        products = 0.5 * (e[..., None, :] @ pair @ e[..., None])[..., 0, 0]
-        squares = e.square()
-        variance = 0.5 * (squares[..., None, :] @ pair @ squares[..., None])[..., 0, 0]
-        partner = pair @ effect  # (m, b, g, p): of all partners
-        expected = -0.5 * torch.einsum("mbgp,bpq,mbgq->mb", effect, self.covariance, partner)
-        known = self.known[..., ::step]
-        pairs = 0.5 * (known[..., None, :] @ pair @ known[..., None])[..., 0, 0]
-        return self._in_sigmas(products - expected, variance, pairs)
+        nearest = torch.where(close, torch.inf, torch.cdist(where, where)).argmin(-1)  # (b, g)
+        e, effect, known = one
+        partner = nearest.expand(e.shape)
+        other = (e.gather(-1, partner), effect.take_along_dim(partner[..., None], dim=-2), known.gather(-1, partner))
+        mutual = nearest.gather(-1, nearest) == number  # a pair of two that are nearest to each other is one
+        return self._alike(one, other, torch.where(mutual, 0.5, 1.0).to(e))
 
-    def _in_sigmas(
-        self, excess: Float[Tensor, "m b"], squares: Float[Tensor, "m b"], pairs: Float[Tensor, "m b"]
+    def _alike(
+        self, one: tuple[Tensor, Tensor, Tensor], other: tuple[Tensor, Tensor, Tensor], weight: Float[Tensor, "b g"]
     ) -> Float[Tensor, "m b"]:
-        """A sum of products less what is expected of it, in its sigma: not below that of the noise as fitted, with
-        which the expected goes, and which may lie far above most residuals."""
+        """Sum of the products of pairs of places less what is expected of it, in its sigma.
+
+        That is not below the sigma of the noise as fitted, with which the expected goes, and which may lie far above
+        most residuals.
+
+        Args:
+            one, other: `e`, `effect` and `known` of the places of each pair.
+            weight: of each pair.
+        """
+        (e, effect, known), (e_other, effect_other, known_other) = one, other
+        products = e * e_other
+        taken = ((effect @ self.covariance) * effect_other).sum(-1)
+        excess, squares, pairs = (
+            (weight * each).sum(-1) for each in (products + taken, products.square(), known * known_other)
+        )
         is_scaled = self.covariance.shape[-1] > 0  # else the noise is known to a factor only
         return excess / (torch.maximum(squares, pairs) if is_scaled else squares).clamp_min(1e-12).sqrt()
 
