@@ -21,7 +21,7 @@ from rmis_calib.solver.assess.information import motion_information, select_d_op
 from rmis_calib.solver.assess.left_out import freed
 from rmis_calib.solver.estimate.map_estimate import map_estimate
 from rmis_calib.solver.estimate.relinearise import Kinematics, solve_relinearised, start_of
-from rmis_calib.solver.model.measurement_rows import pack
+from rmis_calib.solver.model.packing import pack
 from rmis_calib.solver.observation_arrays import MIN_MOTIONS
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import Method, SolverSettings

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from rmis_calib.solver.model.normal_equations import NoiseModel
+from rmis_calib.solver.model.motion_covariance import NoiseModel
 from rmis_calib.solver.model.parameters import ParameterLayout
 from rmis_calib.solver.model.state import State
 from rmis_calib.solver.observability import ObservabilityTensors, Verdict

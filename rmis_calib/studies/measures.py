@@ -9,9 +9,10 @@ from torch import Tensor
 from rmis_calib.geometry.rotations import matrix_to_rotvec
 from rmis_calib.solver import Problem, SolverSettings
 from rmis_calib.solver.estimate.noise_levels import assumed_noise
-from rmis_calib.solver.model.measurement_rows import pack
-from rmis_calib.solver.model.normal_equations import WeightedModel, accumulate
+from rmis_calib.solver.model.normal_equations import accumulate
+from rmis_calib.solver.model.packing import pack
 from rmis_calib.solver.model.parameters import NuisancePriors, initial_state, make_layout
+from rmis_calib.solver.model.weighted_model import WeightedModel
 
 _DRAWS = 20_000
 

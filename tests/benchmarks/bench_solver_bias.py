@@ -27,9 +27,10 @@ from rmis_calib.solver.estimate.bias import _Draws, _turned, simulate
 from rmis_calib.solver.estimate.gauss_newton import solve_system
 from rmis_calib.solver.estimate.map_estimate import MapEstimate, map_estimate
 from rmis_calib.solver.model.batched_linalg import batch_last, dot, rotate, rotate_back, unit
+from rmis_calib.solver.model.jacobian import columns
 from rmis_calib.solver.model.measurement_rows import MeasurementRows
-from rmis_calib.solver.model.normal_equations import NoiseModel, covariance, image_variance
-from rmis_calib.solver.model.parameters import ParameterLayout, columns
+from rmis_calib.solver.model.motion_covariance import NoiseModel, covariance, image_variance
+from rmis_calib.solver.model.parameters import ParameterLayout
 from rmis_calib.solver.model.residuals import linearise
 from rmis_calib.solver.model.state import State
 from tests.benchmarks.solver_common import (

@@ -17,8 +17,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import torch
 
 from rmis_calib.solver import LineStatistics, Problem, SolverSettings, solve
-from rmis_calib.solver.model.measurement_rows import pack
-from rmis_calib.solver.model.parameters import NuisancePriors, columns, initial_state, make_layout
+from rmis_calib.solver.model.jacobian import columns
+from rmis_calib.solver.model.packing import pack
+from rmis_calib.solver.model.parameters import NuisancePriors, initial_state, make_layout
 from rmis_calib.solver.model.residuals import linearise, residual_rows
 from rmis_calib.solver.start.candidates import find_candidates
 from tests.benchmarks.solver_common import (

@@ -23,9 +23,10 @@ from scipy.spatial.transform import Rotation
 from rmis_calib.geometry.rotations import matrix_to_rotvec, skew
 from rmis_calib.solver import Problem, SolverSettings
 from rmis_calib.solver.estimate.noise_levels import assumed_noise
-from rmis_calib.solver.model.measurement_rows import pack
-from rmis_calib.solver.model.normal_equations import covariance, image_variance
-from rmis_calib.solver.model.parameters import NuisancePriors, columns, initial_state, make_layout
+from rmis_calib.solver.model.jacobian import columns
+from rmis_calib.solver.model.motion_covariance import covariance, image_variance
+from rmis_calib.solver.model.packing import pack
+from rmis_calib.solver.model.parameters import NuisancePriors, initial_state, make_layout
 from rmis_calib.solver.model.residuals import linearise, residual_rows
 from rmis_calib.solver.model.state import State
 

@@ -11,7 +11,7 @@ from rmis_calib.config import parse_config
 from rmis_calib.errors import InsufficientDataError
 from rmis_calib.geometry.rotations import rotation_angle
 from rmis_calib.solver import SolverSettings, SolveStatus, solve
-from rmis_calib.solver.model.measurement_rows import pack
+from rmis_calib.solver.model.packing import pack
 from rmis_calib.solver.start.from_points import point_starts
 
 KINDS = ("axis", "contour", "end", "head")

@@ -21,8 +21,9 @@ from rmis_calib.solver.estimate.multistart import cheirality
 from rmis_calib.solver.estimate.noise_levels import COMPONENTS, assumed_noise
 from rmis_calib.solver.estimate.on_graph import attach
 from rmis_calib.solver.estimate.outliers import REJECTED
-from rmis_calib.solver.model.measurement_rows import END, HEAD, LINE, MeasurementRows, pack
-from rmis_calib.solver.model.normal_equations import NoiseModel, motion_distance2
+from rmis_calib.solver.model.measurement_rows import END, HEAD, LINE, MeasurementRows
+from rmis_calib.solver.model.motion_covariance import NoiseModel, motion_distance2
+from rmis_calib.solver.model.packing import pack
 from rmis_calib.solver.model.parameters import TRANSLATION_SIGMA_MM, UNITS, NuisancePriors, initial_state
 from rmis_calib.solver.model.residuals import residual_rows
 from rmis_calib.solver.model.state import State

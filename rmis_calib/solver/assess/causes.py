@@ -15,13 +15,14 @@ from rmis_calib.solver.assess.left_out import TESTED_MOTIONS, eliminated
 from rmis_calib.solver.assess.tested_over import over_of
 from rmis_calib.solver.estimate.map_estimate import MapEstimate
 from rmis_calib.solver.model.batched_linalg import batch_last, cross, dot, rotate
+from rmis_calib.solver.model.jacobian import columns_of
 from rmis_calib.solver.model.linearised_rows import LinearisedRows
 from rmis_calib.solver.model.measurement_rows import MeasurementRows
-from rmis_calib.solver.model.normal_equations import WeightedModel, summed_products, whitened_columns
-from rmis_calib.solver.model.parameters import columns_of
+from rmis_calib.solver.model.normal_equations import summed_products, whitened_columns
 from rmis_calib.solver.model.predicted_shaft import Shaft, rcm_axes
 from rmis_calib.solver.model.residuals import linearise
 from rmis_calib.solver.model.state import State
+from rmis_calib.solver.model.weighted_model import WeightedModel
 from rmis_calib.solver.solution import ClockJump, GroupCheck
 
 CAUSES = ("clock", "clock jump", "camera moved", "intrinsics", "lens", "stereo", "setup", "tool", "joint_offset")

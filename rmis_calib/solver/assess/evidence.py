@@ -27,8 +27,9 @@ from rmis_calib.solver.assess.groups import RIDGE, groups_of, leave_groups_out, 
 from rmis_calib.solver.assess.left_out import Candidates, Freed
 from rmis_calib.solver.estimate.bias import expected_score
 from rmis_calib.solver.estimate.map_estimate import MapEstimate
-from rmis_calib.solver.model.normal_equations import WeightedModel, membership
+from rmis_calib.solver.model.normal_equations import membership
 from rmis_calib.solver.model.state import State
+from rmis_calib.solver.model.weighted_model import WeightedModel
 from rmis_calib.solver.settings import SolverSettings
 
 CHANCE = {"clock_rate": 0.005, "readout": 0.005, "setup": 0.02, "rcm_offset": 0.02, "compliance": 1e-4}

@@ -22,9 +22,10 @@ from rmis_calib.solver.estimate.map_estimate import MapEstimate
 from rmis_calib.solver.estimate.outliers import REJECTED
 from rmis_calib.solver.model.batched_linalg import unit_diagonal
 from rmis_calib.solver.model.measurement_rows import MeasurementRows
-from rmis_calib.solver.model.normal_equations import WeightedModel, member_sums, membership
+from rmis_calib.solver.model.normal_equations import member_sums, membership
 from rmis_calib.solver.model.parameters import ParameterLayout
 from rmis_calib.solver.model.state import State
+from rmis_calib.solver.model.weighted_model import WeightedModel
 from rmis_calib.solver.solution import GroupCheck
 
 LEAST_GROUPS = 5

@@ -5,10 +5,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from rmis_calib.solver.model.batched_linalg import eliminate, rescaled, unit_diagonal
-from rmis_calib.solver.model.normal_equations import WeightedModel, covariance, image_variance
-from rmis_calib.solver.model.parameters import columns
+from rmis_calib.solver.model.jacobian import columns
+from rmis_calib.solver.model.motion_covariance import covariance, image_variance
 from rmis_calib.solver.model.residuals import linearise
 from rmis_calib.solver.model.state import State
+from rmis_calib.solver.model.weighted_model import WeightedModel
 
 THINNING_ROUNDS = 16
 """Motions are picked in this many rounds, the information updated between; one by one keeps under 1 per cent more."""

@@ -11,9 +11,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from rmis_calib.solver.estimate.map_estimate import MapEstimate
-from rmis_calib.solver.model.normal_equations import WeightedModel, accumulate
+from rmis_calib.solver.model.normal_equations import accumulate
 from rmis_calib.solver.model.parameters import NuisancePriors, ParameterLayout, make_layout
 from rmis_calib.solver.model.state import State
+from rmis_calib.solver.model.weighted_model import WeightedModel
 from rmis_calib.solver.problem import stands_still
 from rmis_calib.solver.settings import SolverSettings, UnknownSettings
 

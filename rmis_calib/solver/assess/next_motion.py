@@ -16,10 +16,11 @@ from torch import Tensor
 
 from rmis_calib.solver.assess.information import inverse, motion_information
 from rmis_calib.solver.assess.observability import working_point_jacobian
-from rmis_calib.solver.model.measurement_rows import MeasurementRows, pack
-from rmis_calib.solver.model.normal_equations import WeightedModel
+from rmis_calib.solver.model.measurement_rows import MeasurementRows
+from rmis_calib.solver.model.packing import pack
 from rmis_calib.solver.model.predicted_shaft import Shaft, predict_shaft
 from rmis_calib.solver.model.state import State
+from rmis_calib.solver.model.weighted_model import WeightedModel
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import SolverSettings
 from rmis_calib.solver.solution import Posterior

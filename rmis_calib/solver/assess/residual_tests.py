@@ -34,8 +34,8 @@ from rmis_calib.solver.assess.tested_over import Over, over_of
 from rmis_calib.solver.assess.tested_residuals import TestedResiduals, residuals_of
 from rmis_calib.solver.estimate.bias import simulated_pairs
 from rmis_calib.solver.estimate.map_estimate import MapEstimate
-from rmis_calib.solver.model.normal_equations import WeightedModel
 from rmis_calib.solver.model.state import State
+from rmis_calib.solver.model.weighted_model import WeightedModel
 from rmis_calib.solver.settings import SolverSettings
 from rmis_calib.solver.solution import ClockJump, GroupCheck
 from rmis_calib.solver.test_list import (

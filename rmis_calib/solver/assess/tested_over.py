@@ -7,7 +7,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from rmis_calib.solver.assess.groups import LEVER_MM, where_motions_are
-from rmis_calib.solver.model.measurement_rows import MeasurementRows, pack
+from rmis_calib.solver.model.measurement_rows import MeasurementRows
+from rmis_calib.solver.model.packing import pack
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import NoiseSettings
 from rmis_calib.solver.solution import Solution

@@ -13,10 +13,11 @@ from torch import Tensor
 
 from rmis_calib.solver.model.compliance import basis
 from rmis_calib.solver.model.measurement_rows import MeasurementRows
-from rmis_calib.solver.model.normal_equations import WeightedModel, summed_products, whitened_columns
+from rmis_calib.solver.model.normal_equations import summed_products, whitened_columns
 from rmis_calib.solver.model.parameters import GIVEN_WAY, ParameterLayout
 from rmis_calib.solver.model.residuals import linearise
 from rmis_calib.solver.model.state import State
+from rmis_calib.solver.model.weighted_model import WeightedModel
 from rmis_calib.solver.observation_arrays import CAMERAS
 
 CONTOURS = {"shift": (1, 1, 1, 1), "turn": (-1, 1, -1, 1), "width": (1, 1, -1, -1), "taper": (-1, 1, 1, -1)}

@@ -7,8 +7,9 @@ from torch import Tensor
 
 from rmis_calib.solver.estimate.gauss_newton import solve_system
 from rmis_calib.solver.estimate.outliers import chi2_quantile
-from rmis_calib.solver.model.measurement_rows import pack
-from rmis_calib.solver.model.normal_equations import WeightedModel, normal_equations
+from rmis_calib.solver.model.normal_equations import normal_equations
+from rmis_calib.solver.model.packing import pack
+from rmis_calib.solver.model.weighted_model import WeightedModel
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import SolverSettings
 from rmis_calib.solver.solution import Posterior

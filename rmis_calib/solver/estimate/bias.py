@@ -26,11 +26,13 @@ from torch import Tensor
 from rmis_calib.geometry.rotations import rotvec_to_matrix
 from rmis_calib.solver.model.batched_linalg import cross, dot, unit
 from rmis_calib.solver.model.measurement_rows import LINE, MeasurementRows
-from rmis_calib.solver.model.normal_equations import NoiseModel, WeightedModel, image_variance, normal_equations
+from rmis_calib.solver.model.motion_covariance import NoiseModel, image_variance
+from rmis_calib.solver.model.normal_equations import normal_equations
 from rmis_calib.solver.model.own_rows import own_rows, shaft_poses
 from rmis_calib.solver.model.predicted_shaft import Shaft, predict_shaft
 from rmis_calib.solver.model.residuals import _line_geometry, corrected_points, predicted_s_end
 from rmis_calib.solver.model.state import State
+from rmis_calib.solver.model.weighted_model import WeightedModel
 
 SIMULATED_PART = 16
 """One motion in so many is simulated in long recordings: the expected score is then known to about a fifth of its

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from rmis_calib.solver.model.measurement_rows import END, MeasurementRows
-from rmis_calib.solver.model.normal_equations import NoiseModel
+from rmis_calib.solver.model.motion_covariance import NoiseModel
 from rmis_calib.solver.model.residuals import linearise
 from rmis_calib.solver.model.state import State
 

@@ -12,17 +12,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from rmis_calib.solver.model.batched_linalg import unit_diagonal
-from rmis_calib.solver.model.normal_equations import (
-    Normal,
-    WeightedModel,
-    accumulate,
-    frozen_chi2,
-    normal_equations,
-    with_prior,
-)
+from rmis_calib.solver.model.motion_covariance import frozen_chi2
+from rmis_calib.solver.model.normal_equations import Normal, accumulate, normal_equations, with_prior
 from rmis_calib.solver.model.parameters import ParameterLayout
 from rmis_calib.solver.model.residuals import residual_rows
 from rmis_calib.solver.model.state import State
+from rmis_calib.solver.model.weighted_model import WeightedModel
 from rmis_calib.solver.status import SolveStatus
 
 INITIAL_DAMPING = 1e-4

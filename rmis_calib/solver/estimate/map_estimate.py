@@ -17,10 +17,13 @@ from rmis_calib.solver.estimate.one_step_update import one_step_update
 from rmis_calib.solver.estimate.outliers import REJECTED, classify, classify_contaminated
 from rmis_calib.solver.estimate.use_of_ends import Settled, Settling
 from rmis_calib.solver.model.batched_linalg import rescaled, unit_diagonal
-from rmis_calib.solver.model.measurement_rows import MeasurementRows, pack
-from rmis_calib.solver.model.normal_equations import NoiseModel, Normal, WeightedModel, with_prior
+from rmis_calib.solver.model.measurement_rows import MeasurementRows
+from rmis_calib.solver.model.motion_covariance import NoiseModel
+from rmis_calib.solver.model.normal_equations import Normal, with_prior
+from rmis_calib.solver.model.packing import pack
 from rmis_calib.solver.model.parameters import NuisancePriors, initial_state
 from rmis_calib.solver.model.state import State
+from rmis_calib.solver.model.weighted_model import WeightedModel
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import SolverSettings
 

@@ -10,11 +10,12 @@ from torch import Tensor
 from rmis_calib.solver.estimate.gauss_newton import levenberg_marquardt
 from rmis_calib.solver.estimate.outliers import anneal, chi2_quantile, truncated_cost
 from rmis_calib.solver.model.measurement_rows import MeasurementRows
-from rmis_calib.solver.model.normal_equations import NoiseModel, WeightedModel, camera_distance2
+from rmis_calib.solver.model.motion_covariance import NoiseModel, camera_distance2
 from rmis_calib.solver.model.parameters import NuisancePriors, initial_state, make_layout
 from rmis_calib.solver.model.predicted_shaft import predict_shaft
 from rmis_calib.solver.model.residuals import predicted_s_end
 from rmis_calib.solver.model.state import State
+from rmis_calib.solver.model.weighted_model import WeightedModel
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import SolverSettings
 from rmis_calib.solver.start.candidates import contour_starts, find_candidates

@@ -20,12 +20,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rmis_calib.solver.model.batched_linalg import rescaled, unit_diagonal
+from rmis_calib.solver.model.jacobian import columns
 from rmis_calib.solver.model.linearised_rows import LinearisedRows
 from rmis_calib.solver.model.measurement_rows import END, HEAD, LINE, MeasurementRows
-from rmis_calib.solver.model.normal_equations import NoiseModel, WeightedModel, accumulate, covariance, image_variance
-from rmis_calib.solver.model.parameters import ParameterLayout, columns
+from rmis_calib.solver.model.motion_covariance import NoiseModel, covariance, image_variance
+from rmis_calib.solver.model.normal_equations import accumulate
+from rmis_calib.solver.model.parameters import ParameterLayout
 from rmis_calib.solver.model.residuals import linearise
 from rmis_calib.solver.model.state import State
+from rmis_calib.solver.model.weighted_model import WeightedModel
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import NoiseSettings
 

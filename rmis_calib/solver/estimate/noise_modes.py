@@ -21,8 +21,9 @@ from rmis_calib.solver.estimate.noise_levels import (
     restricted_likelihood,
 )
 from rmis_calib.solver.estimate.outliers import anneal, classify_contaminated
-from rmis_calib.solver.model.normal_equations import NoiseModel, WeightedModel
+from rmis_calib.solver.model.motion_covariance import NoiseModel
 from rmis_calib.solver.model.state import State
+from rmis_calib.solver.model.weighted_model import WeightedModel
 from rmis_calib.solver.settings import SolverSettings
 
 SAMPLE_MOTIONS = 512

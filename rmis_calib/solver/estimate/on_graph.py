@@ -24,10 +24,12 @@ from rmis_calib.solver.estimate.noise_levels import (
 from rmis_calib.solver.estimate.noise_modes import SAMPLE_MOTIONS
 from rmis_calib.solver.model.batched_linalg import rescaled, unit_diagonal
 from rmis_calib.solver.model.implicit import newton_on_graph
-from rmis_calib.solver.model.measurement_rows import pack
-from rmis_calib.solver.model.normal_equations import NoiseModel, WeightedModel, accumulate
+from rmis_calib.solver.model.motion_covariance import NoiseModel
+from rmis_calib.solver.model.normal_equations import accumulate
+from rmis_calib.solver.model.packing import pack
 from rmis_calib.solver.model.parameters import NuisancePriors, initial_state, make_layout
 from rmis_calib.solver.model.state import State
+from rmis_calib.solver.model.weighted_model import WeightedModel
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import SolverSettings
 

@@ -8,8 +8,9 @@ from torch import Tensor
 
 from rmis_calib.solver.estimate.gauss_newton import Refined, solve_system
 from rmis_calib.solver.estimate.outliers import REJECTED, classify
-from rmis_calib.solver.model.normal_equations import WeightedModel, accumulate
+from rmis_calib.solver.model.normal_equations import accumulate
 from rmis_calib.solver.model.state import State
+from rmis_calib.solver.model.weighted_model import WeightedModel
 from rmis_calib.solver.settings import SolverSettings
 from rmis_calib.solver.status import SolveStatus
 

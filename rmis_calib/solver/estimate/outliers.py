@@ -21,8 +21,10 @@ from scipy.special import chdtri
 from torch import Tensor
 
 from rmis_calib.solver.estimate.gauss_newton import solve_system
-from rmis_calib.solver.model.normal_equations import WeightedModel, camera_distance2, normal_equations, with_prior
+from rmis_calib.solver.model.motion_covariance import camera_distance2
+from rmis_calib.solver.model.normal_equations import normal_equations, with_prior
 from rmis_calib.solver.model.state import State
+from rmis_calib.solver.model.weighted_model import WeightedModel
 from rmis_calib.solver.tensors import spans
 
 MIN_WEIGHT = 1e-6

@@ -10,7 +10,7 @@ from rmis_calib.errors import InsufficientDataError
 from rmis_calib.geometry.rigid import rigid_exp
 from rmis_calib.solver.estimate.multistart import race
 from rmis_calib.solver.estimate.noise_levels import assumed_noise
-from rmis_calib.solver.model.measurement_rows import pack
+from rmis_calib.solver.model.packing import pack
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import SolverSettings
 from rmis_calib.solver.start.candidates import contour_starts

@@ -24,10 +24,11 @@ from rmis_calib.solver.estimate.noise_levels import COMPONENTS, free_components,
 from rmis_calib.solver.estimate.noise_modes import CLEARLY, SAMPLE_MOTIONS, USUAL, log_posterior, settle_noise
 from rmis_calib.solver.estimate.outliers import classify_contaminated
 from rmis_calib.solver.model.measurement_rows import END, MeasurementRows
-from rmis_calib.solver.model.normal_equations import NoiseModel, WeightedModel
+from rmis_calib.solver.model.motion_covariance import NoiseModel
 from rmis_calib.solver.model.parameters import NuisancePriors, initial_state, make_layout
 from rmis_calib.solver.model.residuals import linearise
 from rmis_calib.solver.model.state import State
+from rmis_calib.solver.model.weighted_model import WeightedModel
 from rmis_calib.solver.problem import Problem
 from rmis_calib.solver.settings import SolverSettings
 

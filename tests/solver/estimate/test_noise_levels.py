@@ -10,7 +10,8 @@ from rmis_calib.solver import MotionReason, SolverSettings, solve
 from rmis_calib.solver.estimate.bias import expected_score
 from rmis_calib.solver.estimate.map_estimate import map_estimate
 from rmis_calib.solver.estimate.outliers import chi2_quantile, classify
-from rmis_calib.solver.model.normal_equations import camera_distance2, normal_equations
+from rmis_calib.solver.model.motion_covariance import camera_distance2
+from rmis_calib.solver.model.normal_equations import normal_equations
 from rmis_calib.solver.settings import NoiseSettings, UnknownSettings
 
 EXACT = UnknownSettings(radius_sigma_relative=0.0)

@@ -7,8 +7,8 @@ import torch
 from rmis_calib.solver import SolverSettings, solve
 from rmis_calib.solver.estimate.map_estimate import map_estimate
 from rmis_calib.solver.estimate.noise_levels import restricted_likelihood
-from rmis_calib.solver.model.normal_equations import image_variance
-from rmis_calib.solver.model.parameters import columns
+from rmis_calib.solver.model.jacobian import columns
+from rmis_calib.solver.model.motion_covariance import image_variance
 from rmis_calib.solver.model.residuals import linearise
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from rmis_calib.solver import SolverSettings, solve
-from rmis_calib.solver.model.measurement_rows import pack
+from rmis_calib.solver.model.packing import pack
 from rmis_calib.solver.model.parameters import NuisancePriors, initial_state
 from rmis_calib.solver.model.residuals import linearise
 

@@ -7,7 +7,7 @@ import rmis_calib as rc
 from rmis_calib.errors import InputError, ShapeError
 from rmis_calib.geometry import matrix_to_quat, quat_to_matrix, random_quat, rotation_angle, rotvec_to_matrix
 from rmis_calib.solver import Problem, SolverSettings, SolveStatus
-from rmis_calib.solver.model.measurement_rows import pack
+from rmis_calib.solver.model.packing import pack
 from rmis_calib.solver.model.parameters import NuisancePriors, initial_state
 from rmis_calib.solver.model.residuals import residual_rows
 from rmis_calib.solver.start.candidates import solve_translation

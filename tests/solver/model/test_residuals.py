@@ -10,8 +10,10 @@ from rmis_calib.geometry.lines import contour_planes
 from rmis_calib.geometry.rotations import rotvec_to_matrix
 from rmis_calib.solver import Problem, SolverSettings
 from rmis_calib.solver.model import predicted_shaft, residuals
-from rmis_calib.solver.model.measurement_rows import END, HEAD, LINE, pack
-from rmis_calib.solver.model.parameters import NuisancePriors, columns, initial_state, make_layout
+from rmis_calib.solver.model.jacobian import columns
+from rmis_calib.solver.model.measurement_rows import END, HEAD, LINE
+from rmis_calib.solver.model.packing import pack
+from rmis_calib.solver.model.parameters import NuisancePriors, initial_state, make_layout
 from rmis_calib.solver.model.residuals import linearise, residual_rows
 from rmis_calib.solver.settings import UnknownSettings
 
