@@ -63,12 +63,7 @@ def simulate_lines(
         "camera_left_T_camera_right": stereo @ noise((trials,), "stereo"),
         "shaft_radius_mm": scene.shaft_radius_mm,
     }
-    laparoscope_T_base = rigid_inverse(scene.laparoscope.base_T_arm_base)
-    base_T_camera = poses.base_T_arm @ rigid_inverse(scene.camera_right_T_arm)
-    chain = laparoscope_T_base @ base_T_camera @ camera_right_T_arm
-    out["laparoscope_base_T_arm"] = np.broadcast_to(chain, (trials, n, 4, 4)).copy()
-    setup = laparoscope_T_base @ scene.instrument.base_T_arm_base
-    out["laparoscope_base_T_instrument_base"] = np.broadcast_to(setup, (trials, 4, 4)).copy()
+    out |= _chains(scene, poses, camera_right_T_arm)
     out |= _sigmas(config)
     out |= _measure(config, scene, seen_right, poses, generator, "right")
     out |= _measure(config, scene, seen_left, poses, generator, "left")
@@ -81,6 +76,20 @@ def simulate_lines(
         "shaft_end_offset_mm": scene.shaft_end_offset_mm,
     }
     return out
+
+
+def _chains(scene: Scene, poses: Poses, camera_right_T_arm: Array) -> dict[str, Array]:
+    """Of every trial, the laparoscope's kinematics from its own base, (trials, N, 4, 4), and where the instrument's
+    base is in it, (trials, 4, 4)."""
+    trials, n = len(camera_right_T_arm), poses.rcm_v_axis.shape[-2]
+    laparoscope_T_base = rigid_inverse(scene.laparoscope.base_T_arm_base)
+    base_T_camera = poses.base_T_arm @ rigid_inverse(scene.camera_right_T_arm)
+    chain = laparoscope_T_base @ base_T_camera @ camera_right_T_arm
+    setup = laparoscope_T_base @ scene.instrument.base_T_arm_base
+    return {
+        "laparoscope_base_T_arm": np.broadcast_to(chain, (trials, n, 4, 4)).copy(),
+        "laparoscope_base_T_instrument_base": np.broadcast_to(setup, (trials, 4, 4)).copy(),
+    }
 
 
 def _sigmas(config: LineStudyConfig) -> dict[str, float]:

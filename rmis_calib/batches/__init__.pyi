@@ -1,3 +1,4 @@
+from .job_record import JobRecord as JobRecord
 from .plan import plan as plan
 from .pooling import Pooled as Pooled
 from .pooling import pool as pool
@@ -7,4 +8,3 @@ from .settings import BatchSettings as BatchSettings
 from .setups import SetupComparison as SetupComparison
 from .setups import compare as compare
 from .summary import BatchSummary as BatchSummary
-from .task import JobRecord as JobRecord

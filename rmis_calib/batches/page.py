@@ -10,9 +10,9 @@ import numpy as np
 from markupsafe import Markup
 
 from rmis_calib import __version__
+from rmis_calib.batches.job_record import RECORD, JobRecord
 from rmis_calib.batches.setups import SetupComparison
 from rmis_calib.batches.summary import PAGE, BatchSummary, end_of
-from rmis_calib.batches.task import RECORD, JobRecord
 from rmis_calib.io.atomic import atomic_write
 from rmis_calib.io.outputs import check_file, is_report
 from rmis_calib.report.charts.repeatability import plot_repeatability

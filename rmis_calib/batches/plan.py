@@ -7,9 +7,9 @@ from pathlib import Path, PurePosixPath
 
 from rmis_calib import __version__
 from rmis_calib.batches.fingerprint import fingerprint, last_change_s
+from rmis_calib.batches.job_record import JobRecord, Order
 from rmis_calib.batches.jobs import Job, LeftOut, Task, find_jobs
 from rmis_calib.batches.settings import BatchSettings
-from rmis_calib.batches.task import JobRecord, Order
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.io.plain_values import finite_or_none
 

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from rmis_calib.batches.fingerprint import size_bytes
-from rmis_calib.batches.task import JobRecord, Order
+from rmis_calib.batches.job_record import JobRecord, Order
 from rmis_calib.parallel.processes import Event
 
 

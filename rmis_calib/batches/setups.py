@@ -7,6 +7,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from rmis_calib.batches.job_record import JobRecord
 from rmis_calib.batches.pooling import (
     SIGNIFICANT,
     Agreement,
@@ -18,7 +19,6 @@ from rmis_calib.batches.pooling import (
     own_covariances,
     pool,
 )
-from rmis_calib.batches.task import JobRecord
 from rmis_calib.errors import InputError
 from rmis_calib.results import JOINT_OFFSET, CalibrationResult
 

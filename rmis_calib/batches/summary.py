@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rmis_calib.batches.job_record import JobRecord
 from rmis_calib.batches.jobs import LeftOut
 from rmis_calib.batches.setups import SetupComparison
-from rmis_calib.batches.task import JobRecord
 from rmis_calib.io.atomic import atomic_write, write_json
 from rmis_calib.io.outputs import check_file, is_json_of, is_report
 

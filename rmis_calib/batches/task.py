@@ -1,142 +1,29 @@
-"""One job of a batch: a folder with the result, the report, a log and a record, whole or not at all.
-
-`job.json` (format `rmis-calib-job/1`) is the record: what was done, with which inputs and settings, and how it ended.
-It is in the folder from the moment the folder exists.
-"""
+"""One job of a batch: a folder with the result, the report, a log and a record, whole or not at all."""
 
 import contextlib
 import cProfile
 import io
-import json
 import os
 import pstats
 import shutil
-import socket
-import time
 import traceback
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field, replace
-from datetime import UTC, datetime
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-from rmis_calib.batches.jobs import Job
+from rmis_calib.batches.job_record import LOG, Failure, JobRecord, Order, Report, StageLog
+from rmis_calib.batches.rows import row_of_run
 from rmis_calib.errors import DeviceError, OutputError, RmisCalibError
-from rmis_calib.io.atomic import atomic_directory, write_json
-from rmis_calib.io.configs import load_json
-from rmis_calib.io.plain_values import finite_or_none
-from rmis_calib.results import Nuisance
+from rmis_calib.io.atomic import atomic_directory
 
 if TYPE_CHECKING:
-    from rmis_calib.io import RecordingDescription
-    from rmis_calib.pipeline import CalibrationRun
     from rmis_calib.pipeline.pictures.detection import Detectors
-    from rmis_calib.results import CalibrationResult
 
-JOB_FORMAT = "rmis-calib-job/1"
-RECORD, LOG = "job.json", "log.jsonl"
-Failure = Literal["input", "output", "memory", "crash", "device", "bug"]
-"""input: the recording is at fault, and trying again is of no use; the others are the machine's, or the program's."""
 _OUT_OF_MEMORY = ("out of memory", "can't allocate memory", "insufficient memory", "cannot allocate memory")
 _PROFILED = 60
 _REQUESTS = 2
 """Batches of a worker at its device: one is searched while the next waits."""
-
-Report = Callable[[str, int, int], None]
-
-
-@dataclass(frozen=True)
-class Order:
-    """A job as a worker gets it.
-
-    Attributes:
-        job: what to do.
-        target: folder to write.
-        fingerprint: of the inputs and settings.
-        overlays: pictures a camera; -1: every frame.
-        overlay_video: whether to write a video with what was detected and predicted.
-        profile: whether to write where the time went.
-        service: address of the process that owns the device; None: the worker looks at its pictures itself.
-    """
-
-    job: Job
-    target: Path
-    fingerprint: str
-    overlays: int
-    overlay_video: bool
-    profile: bool
-    service: str | None = None
-
-
-@dataclass(frozen=True)
-class JobRecord:
-    """How a job ended.
-
-    Attributes:
-        name, source, task: of the job.
-        fingerprint: of its inputs and settings; None where nothing of it could be looked at.
-        outcome: `finished` with a result, whatever its verdict, or `failed`.
-        failure: kind of failure; None for a finished one.
-        message: the result's line, or why there is none.
-        row: what the summary shows of the result (`row_of_run`).
-        stages: seconds of each stage.
-        seconds: of everything.
-        host: machine that did it.
-        written: when, ISO 8601.
-    """
-
-    name: str
-    source: str
-    task: str
-    fingerprint: str | None
-    outcome: Literal["finished", "failed"]
-    failure: Failure | None
-    message: str
-    row: dict[str, Any] = field(default_factory=dict)
-    stages: dict[str, float] = field(default_factory=dict)
-    seconds: float = 0.0
-    host: str = field(default_factory=socket.gethostname)
-    written: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
-
-    @property
-    def is_final(self) -> bool:
-        """Whether doing it again with the same inputs would end the same way."""
-        return self.outcome == "finished" or self.failure == "input"
-
-    @property
-    def trustworthy(self) -> bool:
-        """A result that passed its own checks; of `detect`, lines in a file."""
-        return self.outcome == "finished" and (self.task == "detect" or self.row.get("status") == "ok")
-
-    @property
-    def line(self) -> str:
-        """How it ended, for people."""
-        return f"failed: {self.message}" if self.outcome == "failed" else self.message
-
-    def write(self, folder: Path) -> None:
-        """Write `job.json`.
-
-        Raises:
-            OutputError: it cannot be written.
-        """
-        write_json(folder / RECORD, {"format": JOB_FORMAT, **finite_or_none(asdict(self))})
-
-    @classmethod
-    def read(cls, folder: Path) -> "JobRecord | None":
-        """The record of an output folder; None where there is none that can be read."""
-        try:
-            raw = load_json(folder / RECORD)
-            if raw.pop("format") != JOB_FORMAT:
-                return None
-            return cls(**raw)
-        except (RmisCalibError, TypeError, KeyError):
-            return None
-
-    @classmethod
-    def of_failure(cls, order: Order, failure: Failure, message: str) -> "JobRecord":
-        """Record of a job that came to no result."""
-        job = order.job
-        return cls(job.name, str(job.source), job.task, order.fingerprint, "failed", failure, message)
 
 
 def run_job(order: Order, report: Report) -> JobRecord:
@@ -237,89 +124,6 @@ def _detectors(order: Order) -> "Detectors":
 
     device = SharedDevice(order.service, config.device)
     return Detectors(device.detector, pictures_on="cpu", at_once=_REQUESTS)
-
-
-def row_of_run(run: "CalibrationRun", description: "RecordingDescription") -> dict[str, Any]:
-    """What the summary shows of a calibration."""
-    row = row_of_result(run.result)
-    row |= {"frames": sum(view.source.count for view in run.views), "setup": setup_of(description)}
-    for view in run.views:
-        row[f"found_{view.side}"] = int(view.found.sum())
-    return row
-
-
-def row_of_result(result: "CalibrationResult") -> dict[str, Any]:
-    """What the summary shows of a result: plain values, lengths in mm, angles in degrees."""
-    clock = result.nuisances.get("clock", Nuisance(value=None, sigma=None, unit="s"))
-    row: dict[str, Any] = {
-        "status": result.status,
-        "method": result.method,
-        "rotation_sigma_deg": result.rotation_sigma_deg,
-        "translation_sigma_mm": result.translation_sigma_mm,
-        "working_point_sigma_mm": result.observability.working_point_sigma_mm,
-        "motions": len(result.motions.used),
-        "motions_used": int(result.motions.used.sum()),
-        "clock_s": None if clock.value is None else round(clock.value, 9),  # rounding is no offset
-        "clock_sigma_s": clock.sigma,
-        "notes": list(result.notes),
-    }
-    for name, residual in result.residuals.items():
-        row[f"residual_{name}_{residual.unit.replace(' ', '_')}"] = residual.median
-    for side, error in (result.head_point_error_px or {}).items():
-        row[f"head_point_{side}_px"] = error.median
-    return row
-
-
-def setup_of(description: "RecordingDescription") -> str:
-    """Name of a robot with its cameras, arms and shaft: recordings of one set-up have one hand-eye transform, and
-    share the deviation of the shaft's radius from the one that was told."""
-    import hashlib
-
-    robot, stereo, diameter_mm = description.robot, description.stereo, description.shaft_diameter_mm
-    arms = {
-        name: asdict(robot.arms[name]) for name in (description.laparoscope_arm, description.instrument_arm) if name
-    }
-    content = [robot.name, robot.dh_convention, arms, asdict(stereo), description.laparoscope_arm, diameter_mm]
-    text = json.dumps(content, sort_keys=True, default=lambda array: array.tolist())
-    height, width = stereo.right.image_size
-    cameras = "stereo" if stereo.left is not None else "mono"
-    digest = hashlib.blake2b(text.encode(), digest_size=3).hexdigest()
-    return f"{robot.name}, {cameras} {width} x {height}, {diameter_mm:g} mm shaft, {digest}"
-
-
-class StageLog:
-    """A progress callback that keeps how long each stage took, and the lines of `log.jsonl`: one JSON object each."""
-
-    def __init__(self, report: Report) -> None:
-        self._report = report
-        self._start = time.monotonic()
-        self._began: dict[str, float] = {}
-        self._lines: list[str] = []
-        self.seconds: dict[str, float] = {}
-
-    def __call__(self, stage: str, done: int, total: int) -> None:
-        now = time.monotonic()
-        if done == 0 or stage not in self._began:
-            self._began[stage] = now
-        if done >= total:
-            took = now - self._began[stage]
-            self.seconds[stage] = round(self.seconds.get(stage, 0.0) + took, 3)
-            self.note("stage", stage=stage, items=total, seconds=round(took, 3))
-            self._began[stage] = now
-        self._report(stage, done, total)
-
-    @property
-    def elapsed_s(self) -> float:
-        return time.monotonic() - self._start
-
-    @property
-    def text(self) -> str:
-        return "".join(f"{line}\n" for line in self._lines)
-
-    def note(self, event: str, **values: Any) -> None:
-        """Add a line."""
-        stamp = datetime.now(UTC).isoformat(timespec="milliseconds")
-        self._lines.append(json.dumps({"time": stamp, "event": event, **values}, ensure_ascii=False))
 
 
 def _classified(error: Exception, source: Path) -> tuple[Failure, str]:

@@ -7,10 +7,11 @@ from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+from rmis_calib.batches.job_record import JobRecord, Order
 from rmis_calib.batches.jobs import with_device
 from rmis_calib.batches.progress import Tracker, Watcher
 from rmis_calib.batches.settings import BatchSettings
-from rmis_calib.batches.task import JobRecord, Order, run_job, write_failure
+from rmis_calib.batches.task import run_job, write_failure
 from rmis_calib.io.outputs import remove_own
 from rmis_calib.parallel import cluster
 from rmis_calib.parallel.processes import Event, Limits, cores, free_memory_bytes, run_tasks

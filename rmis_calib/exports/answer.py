@@ -1,7 +1,6 @@
 """What an export writes: both cameras on the arm, whether to trust them, and where the arms stood."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -105,7 +104,3 @@ class Answer:
         assert transform is not None
         camera_T_arm = in_metres(transform.matrix.numpy())
         return camera_T_arm @ placed.arm_T_instrument_base()
-
-
-Content = str | dict[str, Any]
-"""Text of a file; or of every file of a folder, by its path in it."""

@@ -23,7 +23,8 @@ from rmis_calib.io import Recording, load_recording
 from rmis_calib.io.robot import load_robot
 from rmis_calib.kinematics import RobotKinematics
 from rmis_calib.live.collected import Collected
-from rmis_calib.pipeline.answer.advice import at_found_setup, with_next_motions
+from rmis_calib.pipeline.answer.advice.candidates import at_found_setup
+from rmis_calib.pipeline.answer.advice.next_motions import with_next_motions
 from rmis_calib.pipeline.answer.run import CalibrationRun
 from rmis_calib.pipeline.arms.found_offsets import with_setup
 from rmis_calib.pipeline.arms.poses import MotionPoses, poses_of, predict_contours

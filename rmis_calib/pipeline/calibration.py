@@ -10,12 +10,13 @@ from rmis_calib.config import CalibrationConfig
 from rmis_calib.errors import InsufficientDataError
 from rmis_calib.geometry.rigid import RigidTransform
 from rmis_calib.io import Recording, ShaftObservations
-from rmis_calib.pipeline.answer.advice import with_next_motions
+from rmis_calib.pipeline.answer.advice.next_motions import with_next_motions
 from rmis_calib.pipeline.answer.estimation import estimate, raise_unless_trustworthy
 from rmis_calib.pipeline.answer.guided_look import about_looks, expected_contours, look_along
 from rmis_calib.pipeline.answer.motion_names import MotionNames
 from rmis_calib.pipeline.answer.offsets import estimate_with_kinematics
-from rmis_calib.pipeline.answer.result import insufficient_data, make_result, motions_of, residual_of, residuals_px
+from rmis_calib.pipeline.answer.records.residuals import residual_of, residuals_px
+from rmis_calib.pipeline.answer.result import insufficient_data, make_result, motions_of
 from rmis_calib.pipeline.answer.rolling_shutter import with_rows_at_one_instant
 from rmis_calib.pipeline.answer.run import CalibrationRun
 from rmis_calib.pipeline.arms.found_offsets import with_rcm_offset, with_setup

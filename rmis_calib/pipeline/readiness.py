@@ -15,7 +15,8 @@ from torch import Tensor
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.geometry.cameras import Camera
 from rmis_calib.io import FrameBatch, FrameSource, Recording, load_recording
-from rmis_calib.pipeline.answer.advice import at_found_setup, camera_view, may_advise
+from rmis_calib.pipeline.answer.advice.candidates import at_found_setup
+from rmis_calib.pipeline.answer.advice.next_motions import camera_view, may_advise
 from rmis_calib.pipeline.answer.run import CalibrationRun
 from rmis_calib.pipeline.arms.kinematic_unknowns import KinematicUnknowns
 from rmis_calib.pipeline.arms.poses import MotionPoses, motion_poses

@@ -24,19 +24,17 @@ from rmis_calib.io.configs import load_json
 from rmis_calib.io.outputs import RESULT_FORMAT
 from rmis_calib.io.plain_values import FILE_PART, Covariance6, Number, Plain, Transform
 from rmis_calib.io.validation import first_finding
+from rmis_calib.results.checks import Consistency, PictureCheck, Tests
 from rmis_calib.results.parts import (
-    Consistency,
     HeadPointError,
     Information,
     InstrumentBase,
     KinematicOffsets,
     Motions,
     Nuisance,
-    PictureCheck,
     Residual,
     Setup,
     ShaftEnds,
-    Tests,
 )
 from rmis_calib.solver.observability import Observability
 from rmis_calib.solver.settings import Method

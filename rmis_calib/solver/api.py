@@ -9,16 +9,12 @@ from torch import Tensor
 
 from rmis_calib.errors import InputError, InsufficientDataError, ObservationsError
 from rmis_calib.geometry.rigid import rigid_from_rotation_translation
-from rmis_calib.solver.assess.assemble import (
-    CHECKED_MOTIONS,
-    SHOWN_MOTIONS,
-    joint_on_graph,
-    joint_solution,
-    two_step_solution,
-)
+from rmis_calib.solver.assess.assemble import joint_on_graph, joint_solution
 from rmis_calib.solver.assess.evidence import CHANCE, weigh
 from rmis_calib.solver.assess.information import motion_information, select_d_optimal
 from rmis_calib.solver.assess.left_out import freed
+from rmis_calib.solver.assess.observability import SHOWN_MOTIONS
+from rmis_calib.solver.assess.two_step import CHECKED_MOTIONS, two_step_solution
 from rmis_calib.solver.estimate.map_estimate import map_estimate
 from rmis_calib.solver.estimate.relinearise import Kinematics, solve_relinearised, start_of
 from rmis_calib.solver.model.packing import pack

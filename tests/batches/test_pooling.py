@@ -12,8 +12,8 @@ import data_synth
 import rmis_calib as rc
 from rmis_calib.batches import JobRecord
 from rmis_calib.batches.pooling import changes, drift, pool
+from rmis_calib.batches.rows import setup_of
 from rmis_calib.batches.setups import compare, setups_of, told_diameter_mm
-from rmis_calib.batches.task import setup_of
 from rmis_calib.errors import InputError
 from rmis_calib.io import read_description
 from rmis_calib.results import Information

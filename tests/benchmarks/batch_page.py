@@ -9,9 +9,9 @@ from pathlib import Path
 
 def page_of_many(out: Path, work: Path) -> None:
     """The page of 1,000 recordings: written, and opened and sorted in headless Chromium where there is one."""
+    from rmis_calib.batches.job_record import JobRecord
     from rmis_calib.batches.page import write_index
     from rmis_calib.batches.summary import BatchSummary
-    from rmis_calib.batches.task import JobRecord
 
     folder = work / "many"
     records = [record for record in map(JobRecord.read, sorted((out / "good").iterdir())) if record is not None]

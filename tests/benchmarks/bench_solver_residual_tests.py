@@ -21,7 +21,7 @@ import torch
 
 from rmis_calib.config import parse_config
 from rmis_calib.geometry.rotations import matrix_to_rotvec, rotvec_to_matrix
-from rmis_calib.pipeline.answer.tests_in_words import ranked_causes
+from rmis_calib.pipeline.answer.records.tests_in_words import ranked_causes
 from rmis_calib.solver import Problem, Solution, solve
 from rmis_calib.solver.solution import take_solved
 from tests.benchmarks.bench_solver_misspecified import BEYOND_3_SIGMA, CAMERAS, ERRORS, EXACT, Arrays, scene

@@ -15,7 +15,8 @@ import rmis_calib as rc
 from data_synth.scene import build_scene
 from data_synth.settings import SceneSettings
 from rmis_calib.config import parse_config
-from rmis_calib.pipeline.answer.advice import camera_view, joint_box, joint_candidates, seen_view, with_advice
+from rmis_calib.pipeline.answer.advice.joint_candidates import joint_box, joint_candidates
+from rmis_calib.pipeline.answer.advice.next_motions import camera_view, seen_view, with_advice
 from rmis_calib.pipeline.answer.estimation import estimate, problem_of
 from rmis_calib.pipeline.arms.kinematic_unknowns import KinematicUnknowns
 from rmis_calib.pipeline.arms.poses import motion_poses

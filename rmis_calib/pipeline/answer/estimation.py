@@ -10,9 +10,11 @@ import torch
 from rmis_calib.config import CalibrationConfig
 from rmis_calib.errors import CalibrationFailed, InputError
 from rmis_calib.io import ShaftObservations
-from rmis_calib.pipeline.answer.advice import WHERE, may_advise, pose_candidates, seen_view, with_advice
+from rmis_calib.pipeline.answer.advice.next_motions import may_advise, seen_view, with_advice
+from rmis_calib.pipeline.answer.advice.pose_candidates import WHERE, pose_candidates
 from rmis_calib.pipeline.answer.offsets import estimate_with_kinematics
-from rmis_calib.pipeline.answer.result import make_result, residual_of, residuals_normalised, used_motions
+from rmis_calib.pipeline.answer.records.residuals import residual_of, residuals_normalised
+from rmis_calib.pipeline.answer.result import make_result, used_motions
 from rmis_calib.pipeline.arms.offset_unknowns import FileUnknowns, estimated_offsets, file_unknowns
 from rmis_calib.pipeline.device import require_device
 from rmis_calib.pipeline.motions.observations import problem_of

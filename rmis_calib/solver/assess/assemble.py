@@ -1,6 +1,6 @@
-"""Estimates made into solutions: status, reasons, covariance, nuisances, observability and residuals."""
+"""Joint estimates made into solutions: status, reasons, covariance, set-up and shaft ends."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
@@ -14,100 +14,23 @@ from rmis_calib.solver.assess.evidence import Evidence
 from rmis_calib.solver.assess.groups import check_groups
 from rmis_calib.solver.assess.instrument_base import instrument_base
 from rmis_calib.solver.assess.left_out import reported
-from rmis_calib.solver.assess.observability import assess, detect_degeneracies, turns_about_one_axis
+from rmis_calib.solver.assess.nuisances import nuisances_of
+from rmis_calib.solver.assess.observability import observability_of
 from rmis_calib.solver.assess.residual_tests import answer_tests, fit_tests
+from rmis_calib.solver.assess.residuals_by_motion import residuals_by_motion
 from rmis_calib.solver.estimate.map_estimate import MapEstimate
-from rmis_calib.solver.estimate.multistart import cheirality
-from rmis_calib.solver.estimate.noise_levels import COMPONENTS, assumed_noise
+from rmis_calib.solver.estimate.noise_levels import COMPONENTS
 from rmis_calib.solver.estimate.on_graph import attach
 from rmis_calib.solver.estimate.outliers import REJECTED
-from rmis_calib.solver.model.measurement_rows import END, HEAD, LINE, MeasurementRows
-from rmis_calib.solver.model.motion_covariance import NoiseModel, motion_distance2
-from rmis_calib.solver.model.packing import pack
-from rmis_calib.solver.model.parameters import TRANSLATION_SIGMA_MM, UNITS, NuisancePriors, initial_state
-from rmis_calib.solver.model.residuals import residual_rows
-from rmis_calib.solver.model.state import State
-from rmis_calib.solver.observability import Degeneracy, ObservabilityTensors, Verdict
+from rmis_calib.solver.model.motion_covariance import NoiseModel
 from rmis_calib.solver.problem import Problem
-from rmis_calib.solver.settings import Method, SolverSettings
-from rmis_calib.solver.solution import AlternativeModel, GroupCheck, Nuisance, Posterior, SetupEstimate, Solution
-from rmis_calib.solver.start.candidates import COLLAPSED_MM, collapsed
+from rmis_calib.solver.settings import SolverSettings
+from rmis_calib.solver.solution import AlternativeModel, GroupCheck, Posterior, SetupEstimate, Solution
 from rmis_calib.solver.status import MotionReason, SolveStatus
-from rmis_calib.solver.tensors import spans
 
 MIN_CHEIRALITY = 0.5
-CHECKED_MOTIONS = 256
 MAX_CHI2_PER_DOF = 3.0
 """Past this the model is wrong (swapped cameras, another rig), and no larger noise level makes it right."""
-SHOWN_MOTIONS = 4096
-"""Motions from which the degenerate cases are recognised, and on which the scatter of the two-step methods is
-measured; longer recordings are sampled evenly."""
-
-
-def two_step_solution(
-    flat: Problem, R: Tensor, t: Tensor, covariance: Tensor, settings: SolverSettings, method: Method
-) -> Solution:
-    """Solution of `paper` and `global`, which use the axis lines alone."""
-    axis_only = flat.only("axis")
-    covariance = covariance + _unseen_depth(flat, R, t)
-    measured = pack(axis_only, settings.noise)
-    noise, _ = assumed_noise(flat, settings.noise)
-    state = initial_state(NuisancePriors.of(axis_only), R, t)
-    front = cheirality(measured, state, torch.ones_like(measured.line_ok[0]))
-    status = torch.where(front < MIN_CHEIRALITY, SolveStatus.BEHIND_CAMERA, SolveStatus.CONVERGED)
-    status = torch.where(
-        torch.isfinite(covariance).all(-1).all(-1) & torch.isfinite(t).all(-1), status, SolveStatus.NON_FINITE
-    )
-    seen = measured.line_ok.any(0).any(0)
-    excess = _chi2_per_dof(measured, state, noise)
-    status = torch.where((excess > MAX_CHI2_PER_DOF) & (status == SolveStatus.CONVERGED), SolveStatus.MISFIT, status)
-    observability = _observability(axis_only, R, t, covariance, noise, (False, False, False), settings)
-    static = (observability.degeneracy & Degeneracy.STATIC_LAPAROSCOPE) > 0
-    # A two-step estimate from a laparoscope that stands still is biased by more than its scatter shows (DESIGN.md,
-    # section 3).
-    observability = replace(
-        observability,
-        verdict=torch.where(static, observability.verdict.clamp_min(Verdict.WEAK.code), observability.verdict),
-    )
-    shown = _residuals(measured, state)
-    return Solution(
-        method=method,
-        camera_right_T_arm=rigid_from_rotation_translation(R, t),
-        camera_left_T_camera_right=flat.camera_T_camera_right[:, 1] if flat.n_cameras == 2 else None,
-        covariance=covariance,
-        status=status,
-        cheirality=front,
-        iterations=torch.zeros_like(status),
-        chi2_per_dof=excess,
-        distance=torch.full_like(seen, torch.nan, dtype=t.dtype),
-        reason=torch.where(seen, MotionReason.USED, MotionReason.NOT_MEASURED),
-        noise={},
-        nuisances={},
-        bias=torch.zeros_like(covariance[..., 0]),
-        observability=observability,
-        residual_lines=shown.lines,
-        residual_ends=shown.ends,
-        residual_heads=shown.heads,
-        residual_own=shown.own,
-    )
-
-
-def _chi2_per_dof(measured: MeasurementRows, state: State, noise: NoiseModel) -> Float[Tensor, " b"]:
-    """Weighted squared residuals over degrees of freedom, on a few hundred motions: a fit in the wrong basin shows
-    here where the cheirality does not."""
-    part = measured.narrow(slice(None), slice(None, None, max(1, measured.motions // CHECKED_MOTIONS)))
-    return motion_distance2(part, state, noise).sum(-1) / (part.rows_ok.sum((0, 2)) - 6.0).clamp_min(1.0)
-
-
-def _unseen_depth(flat: Problem, R: Tensor, t: Tensor) -> Float[Tensor, "b 6 6"]:
-    """Variance along the ray of the RCM where the lines of one camera do not tell its distance; zero elsewhere."""
-    p = flat.arm_T_rcm[..., :3, 3] @ R.mT + t[:, None]
-    centred = p - p.mean(-2, keepdim=True)
-    nearly_static = centred.norm(dim=-1).mean(-1) < COLLAPSED_MM
-    unseen = collapsed(p) | (nearly_static if flat.n_cameras == 1 else torch.zeros_like(nearly_static))
-    ray = torch.nn.functional.normalize(p.mean(-2), dim=-1)
-    block = TRANSLATION_SIGMA_MM**2 * ray[:, :, None] * ray[:, None]
-    return torch.nn.functional.pad(torch.where(unseen[:, None, None], block, 0.0), (3, 0, 3, 0))
 
 
 def joint_solution(
@@ -139,7 +62,7 @@ def joint_solution(
     distance = (fit.distance2 / measured.rows_ok.sum(0).clamp_min(1)).sqrt()
     uses = (measured.has_contours, measured.has_ends, measured.has_heads)
     left = rigid_from_rotation_translation(state.stereo_R, state.stereo_t) if measured.cameras == 2 else None
-    shown = _residuals(measured, state)
+    shown = residuals_by_motion(measured, state)
     return Solution(
         method="joint",
         camera_right_T_arm=camera_right_T_arm,
@@ -152,7 +75,7 @@ def joint_solution(
         distance=torch.where(measured.rows_ok.any(0), distance, torch.nan),
         reason=reason,
         noise={name: getattr(fit.model.noise, name).sqrt() for name in COMPONENTS},
-        nuisances=_nuisances(fit, settings),
+        nuisances=nuisances_of(fit, settings),
         bias=fit.bias[:, :6],
         groups=groups,
         clock_jump=jump,
@@ -163,7 +86,7 @@ def joint_solution(
         evidence=evidence.chance,
         doubt={name: doubt[:, :6, :6] for name, doubt in evidence.doubt.items()},
         history=fit.history,
-        observability=_observability(fit.problem, state.R, state.t, C, fit.model.noise, uses, settings),
+        observability=observability_of(fit.problem, state.R, state.t, C, fit.model.noise, uses, settings),
         posterior=_posterior(fit, excess.clamp_min(1.0)),
         residual_lines=shown.lines,
         residual_ends=shown.ends,
@@ -286,99 +209,3 @@ def _judge(fit: MapEstimate) -> tuple[Int[Tensor, " b"], Int[Tensor, "b n"], Flo
     ):
         status = torch.where(wrong & (status == SolveStatus.CONVERGED), code, status)
     return status, reason, excess
-
-
-def _nuisances(fit: MapEstimate, settings: SolverSettings) -> dict[str, Nuisance]:
-    """Every estimated unknown beside the transform."""
-    deviation, _ = fit.model.layout.prior(fit.state)
-    sigma = fit.covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
-    out = {}
-    for name, part in fit.model.layout.blocks.items():
-        if name in ("rotation", "translation"):
-            continue
-        value = fit.state.radius[:, None] if name == "radius" else deviation[:, part]
-        held = sigma[:, part] > settings.unknowns.held_ratio * fit.model.layout.sigma[:, part]
-        out[name] = Nuisance(
-            value=value,
-            sigma=sigma[:, part],
-            unit=UNITS[name],
-            held=held,
-            unseen=_unseen(
-                fit.covariance[:, part, part], fit.model.layout.sigma[:, part], settings.unknowns.held_ratio
-            ),
-            pull=deviation[:, part] / fit.model.layout.sigma[:, part],
-        )
-    return out
-
-
-def _unseen(
-    covariance: Float[Tensor, "b k k"], prior_sigma: Float[Tensor, "b k"], ratio: float
-) -> Float[Tensor, "b k k"]:
-    """Projection onto the combinations whose sigma the data do not bring below `ratio` of the prior.
-
-    Decided along the principal directions, in units of the prior: two offsets of which only the sum shows are each
-    known to 0.7 of their prior, and their difference not at all.
-    """
-    values, vectors = torch.linalg.eigh(torch.nan_to_num(_in_prior_units(covariance, prior_sigma)))
-    chosen = (values > ratio**2).to(values.dtype)
-    return vectors * chosen[:, None] @ vectors.mT
-
-
-def _in_prior_units(covariance: Float[Tensor, "b k k"], prior_sigma: Float[Tensor, "b k"]) -> Float[Tensor, "b k k"]:
-    return covariance / (prior_sigma[:, :, None] * prior_sigma[:, None])
-
-
-def _observability(
-    problem: Problem,
-    R: Tensor,
-    t: Tensor,
-    C: Tensor,
-    noise: NoiseModel,
-    uses: tuple[bool, bool, bool],
-    settings: SolverSettings,
-) -> ObservabilityTensors:
-    if problem.n_motions > SHOWN_MOTIONS:
-        problem = problem.select_motions(slice(None, None, problem.n_motions // SHOWN_MOTIONS))
-    first = assess(problem, R, t, C, settings.verdict, torch.zeros_like(t[:, 0], dtype=torch.int64))
-    distance = torch.linalg.vector_norm(first.working_point_mm, dim=-1)
-    flags = detect_degeneracies(
-        problem, noise.kinematics_mm.sqrt(), noise.kinematics_rad.sqrt(), uses, settings.noise, distance
-    )
-    if settings.unknowns.setup != "known" and problem.laparoscope_base_T_arm is not None:
-        flags = flags + Degeneracy.SETUP_AND_TRANSFORM * turns_about_one_axis(problem.laparoscope_base_T_arm)
-    return replace(first, degeneracy=flags)
-
-
-@dataclass(frozen=True)
-class _Residuals:
-    """Root mean square residuals per camera and motion of each kind; NaN where not measured. Those of the user's own
-    measurements by name, of their camera."""
-
-    lines: Float[Tensor, "b c n"]
-    ends: Float[Tensor, "b c n"]
-    heads: Float[Tensor, "b c n"]
-    own: dict[str, Float[Tensor, "b n"]]
-
-
-def _residuals(measured: MeasurementRows, state: State) -> _Residuals:
-    """Residuals of all motions, a long recording in parts."""
-    step = 8 * SHOWN_MOTIONS // measured.trials
-    parts = [_residuals_of(measured.narrow(slice(None), part), state) for part in spans(measured.motions, step)]
-    lines, ends, heads, *own = (torch.cat(each, dim=-1) for each in zip(*parts, strict=True))
-    names = [(rows.name, rows.camera) for rows in measured.own]
-    by_name = {name: value[:, camera] for (name, camera), value in zip(names, own, strict=True)}
-    return _Residuals(lines, ends, heads, by_name)
-
-
-def _residuals_of(measured: MeasurementRows, state: State) -> list[Float[Tensor, "b c n"]]:
-    """Lines, ends, heads and each of the user's own, of motions that fit into memory at once; rows take turns between
-    the cameras."""
-    squares, ok, c = residual_rows(measured, state).square_(), measured.rows_ok, measured.cameras
-    widths = [measured.row_kind.count(kind) for kind in (LINE, END, HEAD)] + [c * len(rows.ok) for rows in measured.own]
-    out, start = [], 0
-    for width in widths:
-        part = slice(start, start + width)
-        total, count = (x[part].unflatten(0, (-1, c)).sum(0) for x in (squares, ok))
-        out.append(torch.where(count > 0, (total / count.clamp_min(1)).sqrt(), torch.nan).transpose(0, 1))
-        start = part.stop
-    return out

@@ -25,7 +25,6 @@ from rmis_calib.solver.model.state import State
 from rmis_calib.solver.model.weighted_model import WeightedModel
 from rmis_calib.solver.solution import ClockJump, GroupCheck
 
-CAUSES = ("clock", "clock jump", "camera moved", "intrinsics", "lens", "stereo", "setup", "tool", "joint_offset")
 LENGTH_MM = 100.0
 """Distance from the RCM at which the bend of a unit is one."""
 SEEN = 1e-4

@@ -105,19 +105,10 @@ def advise(
     """
     state = posterior.state
     A = working_point_jacobian(state.t[0], working_point_mm, settings.verdict.lever_mm)
-
     information = posterior.information[0]
     allowance = torch.zeros_like(A) if reported is None else A @ (reported - inverse(information)[:6, :6]) @ A.mT
 
-    def left(information: Float[Tensor, "*m p p"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Trace by the model alone; weakest sigma and sigma at the working point with the allowance."""
-        C = A @ inverse(information)[..., :6, :6] @ A.mT
-        trace, C = C.diagonal(dim1=-2, dim2=-1).sum(-1), C + allowance
-        weakest = torch.linalg.eigvalsh(C)[..., -1].clamp_min(0.0).sqrt()
-        at_point = C[..., 3:, 3:].diagonal(dim1=-2, dim2=-1).sum(-1).clamp_min(0.0).sqrt()
-        return trace, weakest, at_point
-
-    before, *now = left(information)
+    before, *now = _remaining(information, A, allowance)
     view = _narrowed(view, now[1] / torch.linalg.vector_norm(working_point_mm))
     gain, visible = predicted_information(candidates, posterior, view, settings)
     chosen, path = [], [now]
@@ -126,7 +117,7 @@ def advise(
     for step in range(settings.advice.motions):
         if not bool(open_.any()):
             break
-        trace, weakest, at_point = left(information + gain)
+        trace, weakest, at_point = _remaining(information + gain, A, allowance)
         trace = torch.where(open_, trace, torch.inf)
         if step == 0:
             alone = torch.where(visible, weakest, torch.inf)
@@ -144,6 +135,18 @@ def advise(
         alone_mm=alone,
         visible=visible,
     )
+
+
+def _remaining(
+    information: Float[Tensor, "*m p p"], A: Float[Tensor, "6 6"], allowance: Float[Tensor, "6 6"]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What is left of the uncertainty at the working point: its trace by the model alone; with the allowance, the
+    weakest direction's sigma and that of the point."""
+    C = A @ inverse(information)[..., :6, :6] @ A.mT
+    trace, C = C.diagonal(dim1=-2, dim2=-1).sum(-1), C + allowance
+    weakest = torch.linalg.eigvalsh(C)[..., -1].clamp_min(0.0).sqrt()
+    at_point = C[..., 3:, 3:].diagonal(dim1=-2, dim2=-1).sum(-1).clamp_min(0.0).sqrt()
+    return trace, weakest, at_point
 
 
 def _alike(candidates: Problem, index: int) -> Bool[Tensor, " m"]:

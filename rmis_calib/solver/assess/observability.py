@@ -6,19 +6,25 @@ before its principal directions are taken, and "not observable" means a predicte
 singular matrix.
 """
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from rmis_calib.geometry.rotations import matrix_to_rotvec, skew
+from rmis_calib.solver.model.motion_covariance import NoiseModel
 from rmis_calib.solver.observability import Degeneracy, ObservabilityTensors, Verdict
 from rmis_calib.solver.problem import Problem
-from rmis_calib.solver.settings import NoiseSettings, VerdictSettings
+from rmis_calib.solver.settings import NoiseSettings, SolverSettings, VerdictSettings
 
 LEAST_TURN_RAD = 5e-3
 """Spread of the laparoscope's turns about a second axis below which it turned about one only."""
 NOISE_MARGIN = 3.0
 """A spread below this many sigma of the kinematics' noise counts as no motion."""
+SHOWN_MOTIONS = 4096
+"""Motions from which the degenerate cases are recognised, and on which the scatter of the two-step methods is
+measured; longer recordings are sampled evenly."""
 
 
 def working_point(problem: Problem, R: Tensor, t: Tensor, settings: VerdictSettings) -> Float[Tensor, "b 3"]:
@@ -142,3 +148,29 @@ def _cone(v: Float[Tensor, "b n 3"], floor: Tensor) -> Tensor:
     residual = ((squares - flat @ fit)[..., 0].square().mean(-1)).sqrt() / (2.0 * radius)
     tall = (centred @ axes[..., :1]).square().mean((-2, -1)).sqrt()
     return (residual < floor) & (tall < floor) & (radius < 1.0)
+
+
+def observability_of(
+    problem: Problem,
+    R: Tensor,
+    t: Tensor,
+    C: Tensor,
+    noise: NoiseModel,
+    uses: tuple[bool, bool, bool],
+    settings: SolverSettings,
+) -> ObservabilityTensors:
+    """What the data can see by an estimate, with the degenerate cases among its motions.
+
+    Args:
+        uses: whether contours, ends and heads were measured and used.
+    """
+    if problem.n_motions > SHOWN_MOTIONS:
+        problem = problem.select_motions(slice(None, None, problem.n_motions // SHOWN_MOTIONS))
+    first = assess(problem, R, t, C, settings.verdict, torch.zeros_like(t[:, 0], dtype=torch.int64))
+    distance = torch.linalg.vector_norm(first.working_point_mm, dim=-1)
+    flags = detect_degeneracies(
+        problem, noise.kinematics_mm.sqrt(), noise.kinematics_rad.sqrt(), uses, settings.noise, distance
+    )
+    if settings.unknowns.setup != "known" and problem.laparoscope_base_T_arm is not None:
+        flags = flags + Degeneracy.SETUP_AND_TRANSFORM * turns_about_one_axis(problem.laparoscope_base_T_arm)
+    return replace(first, degeneracy=flags)

@@ -15,7 +15,7 @@ Beside these stand the tests that compare answers: of two halves of the motions,
 (groups.py), and the clock before and after (clock_jump.py).
 
 A further kind of residual needs its values alone: `solution.tests.joined(residual_tests(TestedResiduals.of_values(...),
-over_of_solution(...)))`; words for it stand in `pipeline.answer.tests_in_words`.
+over_of_solution(...)))`; words for it stand in `pipeline.answer.records.tests_in_words`.
 
 All are corrected together for their number (Holm 1979, with weights: Genovese, Roeder & Wasserman 2006): the few
 comparisons of answers are worth more than each of a hundred tests of residuals.

@@ -105,13 +105,6 @@ def membership(group: Int[Tensor, "b n"], count: int, dtype: torch.dtype) -> Flo
     return torch.nn.functional.one_hot(group + 1, count + 1)[..., 1:].to(dtype)
 
 
-def group_sums(
-    model: WeightedModel, state: State, group: Int[Tensor, "b n"], count: int
-) -> tuple[Float[Tensor, "b g p p"], Float[Tensor, "b g p"]]:
-    """Information and score of `count` groups of motions, without priors; motions of no group (-1) do not count."""
-    return member_sums(model, state, membership(group, count, state.t.dtype))
-
-
 def member_sums(
     model: WeightedModel, state: State, member: Float[Tensor, "b n g"]
 ) -> tuple[Float[Tensor, "b g p p"], Float[Tensor, "b g p"]]:

@@ -10,8 +10,9 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 
-from rmis_calib.pipeline.answer.result import consistency_of, judge
-from rmis_calib.pipeline.answer.tests_in_words import told_tests
+from rmis_calib.pipeline.answer.records.consistency import consistency_of
+from rmis_calib.pipeline.answer.records.tests_in_words import told_tests
+from rmis_calib.pipeline.answer.result import judge
 from rmis_calib.solver import SolverSettings, solve
 from rmis_calib.solver.observability import Verdict
 from rmis_calib.solver.settings import UnknownSettings

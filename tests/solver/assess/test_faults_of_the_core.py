@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from rmis_calib.errors import ObservationsError
 from rmis_calib.geometry.rotations import rotation_angle
 from rmis_calib.solver import Problem, SolverSettings, solve
-from rmis_calib.solver.assess.assemble import _unseen
+from rmis_calib.solver.assess.nuisances import _unseen
 from rmis_calib.solver.assess.observability import assess
 from rmis_calib.solver.settings import VerdictSettings
 from rmis_calib.solver.start.paper import MIN_LINES, votes

@@ -7,7 +7,7 @@ import torch
 import rmis_calib as rc
 from rmis_calib.config import parse_config
 from rmis_calib.geometry.rotations import matrix_to_rotvec
-from rmis_calib.pipeline.answer.result import about_groups
+from rmis_calib.pipeline.answer.records.consistency import about_groups
 from rmis_calib.pipeline.words import ranges_in_words
 from rmis_calib.results import Change, Consistency, Shift
 from rmis_calib.solver import Problem, solve

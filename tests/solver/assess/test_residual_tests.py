@@ -7,7 +7,7 @@ import torch
 from data_synth.lines import simulate_lines
 from data_synth.settings import LineStudyConfig
 from rmis_calib.config import parse_config
-from rmis_calib.pipeline.answer.tests_in_words import about_neighbours
+from rmis_calib.pipeline.answer.records.tests_in_words import about_neighbours
 from rmis_calib.results import ResidualTest, Tests
 from rmis_calib.solver import Problem, Solution, solve
 from rmis_calib.solver.assess.residual_tests import residual_tests

@@ -5,6 +5,8 @@ from rmis_calib.solver import Solution
 
 KINDS = ("unknown", "tube", "ring")
 """Kinds of end in the order of `Solution.ends`."""
+OTHER_TOOL_MM = 25.0
+"""Distance of the shaft's end from its nominal place that no wrist explains: the metal of one is 5 to 20 mm long."""
 
 
 def ends_of(solution: Solution) -> ShaftEnds | None:
@@ -43,3 +45,19 @@ def about_ends(solution: Solution) -> tuple[str, ...]:
             "than most, and were left out (the metal's tip, or what lies over the shaft?)."
         )
     return tuple(said)
+
+
+def about_tool(solution: Solution) -> tuple[str, ...]:
+    """Whether the shaft ends so far from where the tool's table says that it is another tool's."""
+    end = solution.nuisances.get("end_offset")
+    if end is None:
+        return ()
+    offset, sigma = float(end.value.reshape(-1)[0]), float(end.sigma.reshape(-1)[0])
+    if abs(offset) - 3.0 * sigma < OTHER_TOOL_MM:
+        return ()
+    where = "beyond" if offset > 0 else "before"
+    return (
+        f"The shaft ends {abs(offset):.0f} mm {where} the place given by the tool's table: does the table belong "
+        "to another tool (the wrists of S/Si and Classic instruments are 50 mm apart), or is the length of a wrist "
+        "missing?",
+    )
