@@ -176,10 +176,9 @@ def _spread(listed: Tensor, keep: Bool[Tensor, "b k"]) -> Tensor:
 
 def _reason(stages: SearchTrace, scores: Tensor, clear: Tensor, valid: Tensor, broken: Tensor) -> Int[Tensor, " b"]:
     """The furthest stage that each frame reached."""
-    weight = stages.seen.to(stages.unlike.dtype)
-    total = weight.sum((1, 2)).clamp(min=1.0)
-    mean = (stages.unlike * weight).sum((1, 2)) / total
-    spread = ((stages.unlike - mean[:, None, None]).square() * weight).sum((1, 2)) / total
+    lost = ~valid.any(1)
+    uniform = lost.clone()
+    uniform[lost] = _uniform(stages.unlike[lost], stages.seen[lost])
     evidence = stages.evidence
     reason = torch.full_like(scores[:, 0], FrameReason.AMBIGUOUS, dtype=torch.int64)
     for failed, why in (
@@ -187,8 +186,17 @@ def _reason(stages: SearchTrace, scores: Tensor, clear: Tensor, valid: Tensor, b
         (~(scores > 0).any(1), FrameReason.TOO_SHORT),
         (~(evidence.on.any(-1) & evidence.strips.valid).any(1), FrameReason.NOT_A_CYLINDER),
         (~evidence.strips.valid.any(1), FrameReason.NO_STRAIGHT_EDGES),
-        ((spread < 0.02**2) | ~stages.seen.flatten(1).any(1), FrameReason.NO_PICTURE),
+        (uniform, FrameReason.NO_PICTURE),
         (broken, FrameReason.BAD_PIXELS),
     ):
         reason = torch.where(failed, int(why), reason)
-    return torch.where(valid.any(1), int(FrameReason.OK), reason)
+    return torch.where(lost, reason, int(FrameReason.OK))
+
+
+def _uniform(unlike: Float[Tensor, "m h w"], seen: Bool[Tensor, "m h w"]) -> Bool[Tensor, " m"]:
+    """Whether a picture is of one tone, or has no field of view."""
+    weight = seen.to(unlike.dtype)
+    total = weight.sum((1, 2))
+    mean = (unlike * weight).sum((1, 2)) / total.clamp(min=1.0)
+    spread = ((unlike - mean[:, None, None]).square() * weight).sum((1, 2)) / total.clamp(min=1.0)
+    return (spread < 0.02**2) | (total == 0)

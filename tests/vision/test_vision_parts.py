@@ -6,17 +6,18 @@ import numpy as np
 import pytest
 import torch
 from drawn_bars import draw_bar
+from kornia.filters import gaussian_blur2d, spatial_gradient
 from pydantic import ValidationError
 
 from rmis_calib.geometry import Camera
 from rmis_calib.vision import DetectorSettings, FrameReason
-from rmis_calib.vision.coarse.appearance import field_of_view, shaft_contrast, weighted_tint
-from rmis_calib.vision.coarse.hough import EdgePixels, peaks, refine, vote
+from rmis_calib.vision.coarse.appearance import field_of_view, shaft_contrast, smooth, weighted_tint
+from rmis_calib.vision.coarse.hough import EdgePixels, gradients, peaks, refine, vote
 from rmis_calib.vision.coarse.wrists import between_wrists
 from rmis_calib.vision.image.canvas import plan_canvas, shrink
 from rmis_calib.vision.image.line_fit import fit_lines
 from rmis_calib.vision.image.pixel_mapping import Lens
-from rmis_calib.vision.image.run_length import bridge, longest_run, run_lengths
+from rmis_calib.vision.image.run_length import bridge, longest_run, lowest, run_lengths
 
 
 @pytest.mark.parametrize("field", [{"max_shafts": 0}, {"min_contrast": float("nan")}, {"edge_sample": 300}])
@@ -35,6 +36,19 @@ def test_runs() -> None:
     gap = torch.tensor([1.0])
     assert bridge(on, gap).int().tolist() == [[1, 1, 1, 1, 1, 1, 0, 0, 0, 1]]
     assert longest_run(on, gap).int().tolist() == [[1, 1, 0, 1, 1, 1, 0, 0, 0, 0]]
+
+
+def test_blur_and_gradients_are_those_of_kornia() -> None:
+    pictures = torch.rand(3, 37, 53, generator=torch.Generator().manual_seed(0))
+    blurred = gaussian_blur2d(pictures[:, None], (9, 9), (1.4, 1.4), border_type="replicate")[:, 0]
+    assert torch.allclose(smooth(pictures), blurred, rtol=0, atol=1e-6)
+    across, down = spatial_gradient(pictures[:, None], mode="diff")[:, 0].unbind(1)
+    assert [torch.equal(*pair) for pair in zip(gradients(pictures), (across, down), strict=True)] == [True, True]
+
+
+def test_ranks() -> None:
+    values = torch.randn(7, 4, 50, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(torch.stack(lowest(values, 5)), values.sort(0).values[:5])
 
 
 @pytest.mark.parametrize("factor", [1, 2, 3, 4, 5, 6])

@@ -7,9 +7,9 @@ brightness, so that the same step counts as much in a corner without light as in
 
 import torch
 from jaxtyping import Bool, Float
-from kornia.filters import gaussian_blur2d
+from kornia.filters import get_gaussian_kernel1d
 from torch import Tensor
-from torch.nn.functional import interpolate
+from torch.nn.functional import interpolate, pad
 
 # Below this brightness (fraction of full scale) ratios drown in sensor noise.
 _TONE_FLOOR = 0.06
@@ -20,7 +20,10 @@ _LIT_TINT_WEIGHT = 3.0
 # Below the scene's median log brightness: a cavity's depth gets a third of the light of tissue, and less.
 _CAVITY_DARKER = 1.0
 _BORDER_ROWS = 24
-_BLUR_PX = 1.4
+# Columns that stand for "no border here" before and after the hull: chords to the first lie beyond the second.
+_ABSENT, _NOWHERE = 1e9, 1e6
+# Weights of a Gaussian of 1.4 px, from its middle outwards.
+_BLUR = tuple(get_gaussian_kernel1d(9, 1.4)[0, 4:].tolist())
 
 
 def opponent_colours(rgb: Float[Tensor, "b 3 h w"]) -> tuple[Float[Tensor, "b h w"], Float[Tensor, "b h w"]]:
@@ -82,10 +85,20 @@ def weighted_tint(
 def smooth(picture: Float[Tensor, "b h w"]) -> Float[Tensor, "b h w"]:
     """Gaussian blur of 1.4 px, the borders continued.
 
-    Pictures go as channels of one: as a batch of single channels the same blur takes several times as long on a CPU.
+    Sums of shifted pictures: half of the time of kornia's convolution for eight pictures on a CPU, a thirtieth for one.
     """
-    channels = picture.expand(max(2, len(picture)), -1, -1)  # one channel alone goes another way, and is rounded so
-    return gaussian_blur2d(channels[None], (9, 9), (_BLUR_PX, _BLUR_PX), border_type="replicate")[0, : len(picture)]
+    height, width = picture.shape[1:]
+    half = len(_BLUR) - 1
+    around = pad(picture[:, None], (half, half, half, half), mode="replicate")[:, 0]
+    rows = around[:, :, half : half + width] * _BLUR[0]
+    for shift in range(1, half + 1):
+        both = around[:, :, half - shift :][:, :, :width] + around[:, :, half + shift :][:, :, :width]
+        rows.add_(both, alpha=_BLUR[shift])
+    blurred = rows[:, half : half + height] * _BLUR[0]
+    for shift in range(1, half + 1):
+        both = rows[:, half - shift :][:, :height] + rows[:, half + shift :][:, :height]
+        blurred.add_(both, alpha=_BLUR[shift])
+    return blurred
 
 
 def field_of_view(
@@ -108,16 +121,17 @@ def field_of_view(
     empty = lit.sum(-1) < 0.25 * width  # a row that only an interlaced or half-black line reaches is no picture
     top = torch.where(empty, height, rows).amin(-1)
     bottom = torch.where(empty, -1, rows).amax(-1)
-    left = _convex(torch.where(empty, torch.inf, first))
-    right = -_convex(torch.where(empty, torch.inf, -last))
+    cuts = torch.where(empty, torch.inf, torch.stack([first, -last]))
+    left, right = _convex(cuts.flatten(0, 1)).unflatten(0, (2, -1)).unbind(0)
+    right = -right
     field = []
     for rim in (0, margin):
         # Half of the rim along the border of the picture itself: its last rows may be half black.
         low, high = left + rim * (0.5 + 0.5 * (left > 0)), right - rim * (0.5 + 0.5 * (right < width - 1))
         first_row, last_row = top + rim * (0.5 + 0.5 * (top > 0)), bottom - rim * (0.5 + 0.5 * (bottom < height - 1))
-        across = (columns >= low[..., None]) & (columns <= high[..., None])
         down = (rows >= first_row[:, None]) & (rows <= last_row[:, None])
-        field.append(across & down[..., None])
+        low = torch.where(down, low, torch.inf)
+        field.append((columns >= low[..., None]) & (columns <= high[..., None]))
     return field[0], field[1]
 
 
@@ -127,13 +141,13 @@ def _convex(extent: Float[Tensor, "b h"]) -> Float[Tensor, "b h"]:
     rows = torch.linspace(0, height - 1, _BORDER_ROWS, device=extent.device).round().long()
     # A column cut by noise in one row must not open the field: the median of three neighbours.
     padded = torch.cat([extent[:, :1], extent, extent[:, -1:]], 1)
-    steady = padded.unfold(1, 3, 1).median(-1).values[:, rows]
+    steady = padded.unfold(1, 3, 1)[:, rows].median(-1).values.clamp(max=_ABSENT)
+    # Every chord between two rows, at all rows between them.
+    first, last = torch.triu_indices(_BORDER_ROWS, _BORDER_ROWS, device=extent.device)
     y = rows.to(extent.dtype)
-    a, b, at = y[:, None, None], y[None, :, None], y[None, None, :]
-    share = ((at - a) / (b - a).clamp(min=1e-6)).clamp(0.0, 1.0)
-    between = (at >= a) & (at <= b)
-    chord = steady[:, :, None, None] * (1 - share) + steady[:, None, :, None] * share
-    chord = torch.where(between & torch.isfinite(chord), chord, torch.inf)
-    hull = chord.amin((1, 2))
-    hull = torch.where(torch.isfinite(hull), hull, 1e6)
+    a, b = y[first, None], y[last, None]
+    share = ((y - a) / (b - a).clamp(min=1e-6)).clamp(0.0, 1.0)
+    beyond = torch.where((y >= a) & (y <= b), 0.0, torch.inf)
+    chord = (steady[:, first, None] * (1 - share)).add_(steady[:, last, None] * share).add_(beyond)
+    hull = chord.amin(1).clamp(max=_NOWHERE)
     return interpolate(hull[:, None], size=height, mode="linear", align_corners=True)[:, 0]

@@ -3,12 +3,15 @@
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import pad
 
-from rmis_calib.vision.image.run_length import first_on, last_on, longest_run
+from rmis_calib.vision.image.run_length import first_on, last_on, longest_run, lowest
 
 # Log brightness: metal is two to three times as bright as the shaft before it (0.7 to 1.1) on the rendered pictures,
 # and half of that in the da Vinci and grasper frames; light along a shaft changes by less over a width.
 _RISE = 0.3
+# Stations read on either side of each.
+_READ = 7
 
 
 def between_wrists(
@@ -32,19 +35,20 @@ def between_wrists(
         width: width of the strip, in stations.
     """
     place = torch.arange(brightness.shape[-1], device=brightness.device, dtype=brightness.dtype)
-    rise = _rise_ahead(brightness, on, 0.8 * width)
+    # Long medians are as high half a width around the step; short ones (the last) say where in this it is.
+    values = torch.stack([brightness, *beside.unbind(-2), tint, brightness], -2)
+    masks = torch.stack([on, on, on, seen, on], -2)
+    reach = width[..., None] * width.new_tensor([0.8, 0.8, 0.8, 1.2, 0.3])
+    rise, left, right, tinted, step = _rise_ahead(values, masks, reach).unbind(-2)
     # Towards the light, as from a vignette, both sides grow brighter as well.
-    common = _rise_ahead(beside, on[..., None, :].expand_as(beside), 0.8 * width[..., None].expand(*width.shape, 2))
-    rise, fall = rise - common.amin(-2).clamp(min=0.0), -rise + common.amax(-2).clamp(max=0.0)
-    tinted = _rise_ahead(tint, seen, 1.2 * width).abs() > _RISE
+    rise, fall = rise - torch.minimum(left, right).clamp(min=0.0), -rise + torch.maximum(left, right).clamp(max=0.0)
+    tinted = tinted.abs() > _RISE
     run = longest_run(on, 0.7 * width)
     reach = 0.5 * width + 3
     low = first_on(place, run) - first_on(place, seen) < reach
     high = last_on(place, seen) - last_on(place, run) < reach
     upwards = torch.where(low == high, rise.amax(-1) > fall.amax(-1), low)
     up, down = on & (rise > _RISE), on & (fall > _RISE)
-    # Long medians are as high half a width around the step; short ones say where in this it is.
-    step = _rise_ahead(brightness, on, 0.3 * width)
     end, begin = _first_peak(rise + step, up, False), _first_peak(fall - step, down, True)
     neutral_end, neutral_begin = (~tinted.gather(-1, at.long()[..., None])[..., 0] for at in (end, begin))
     return (
@@ -60,20 +64,21 @@ def _rise_ahead(
 
     Only stations in the mask count; 0 where either side has less than half of its own.
     """
-    share = torch.arange(1, 8, device=value.device) / 7.0
-    steps = (reach[..., None, None] * share).round().clamp(min=1).long()  # (*b, 1, 7)
-    at = torch.arange(value.shape[-1], device=value.device)[:, None]
-    known = torch.where(on, value, torch.nan)
-    known = known[..., None, :].expand(*known.shape, known.shape[-1])
+    share = torch.arange(1, _READ + 1, device=value.device) / _READ
+    steps = (reach[..., None] * share).round().clamp(min=1).long()  # (*b, 7)
+    steps = torch.cat([steps, -steps], -1)[..., None]
+    count = value.shape[-1]
+    known = pad(torch.where(on, value, torch.inf), (1, 1), value=torch.inf)
+    at = (torch.arange(1, count + 1, device=value.device) + steps).clamp(0, count + 1)
+    read = known.gather(-1, at.flatten(-2)).unflatten(-1, (2, _READ, count))
+    ahead, behind = _known_median(read.movedim(-2, 0)).unbind(-2)
+    return torch.where(torch.isfinite(ahead) & torch.isfinite(behind), ahead - behind, 0.0)
 
-    def median(index: Tensor) -> tuple[Tensor, Tensor]:
-        inside = (index >= 0) & (index < value.shape[-1])
-        read = known.gather(-1, index.clamp(0, value.shape[-1] - 1).expand(*known.shape[:-1], 7))
-        read = torch.where(inside, read, torch.nan)
-        return read.nanmedian(-1).values, torch.isfinite(read).sum(-1) >= 5
 
-    (ahead, known_ahead), (behind, known_behind) = median(at + steps), median(at - steps)
-    return torch.where(known_ahead & known_behind, ahead - behind, 0.0)
+def _known_median(values: Float[Tensor, "7 *b s"]) -> Float[Tensor, "*b s"]:
+    """The lower median of the finite ones of seven; infinite where less than five are."""
+    *_, third, fourth, fifth = lowest(values, 5)
+    return torch.where(torch.isfinite(fifth), torch.where(torch.isfinite(values.amax(0)), fourth, third), torch.inf)
 
 
 def _first_peak(value: Float[Tensor, "*b s"], on: Bool[Tensor, "*b s"], from_high: bool) -> Float[Tensor, "*b"]:

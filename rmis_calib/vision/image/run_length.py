@@ -85,16 +85,21 @@ def last_on(t: Float[Tensor, " s"], mask: Bool[Tensor, "*b s"]) -> Float[Tensor,
     return torch.where(torch.isfinite(high), high, 0.0)
 
 
+def lowest(values: Float[Tensor, "n *b s"], count: int) -> list[Float[Tensor, "*b s"]]:
+    """The `count` smallest over the first dimension, in order: by comparisons of whole rows, ten times as fast as
+    sorting or `kthvalue`."""
+    ranks: list[Tensor] = []
+    for value in values:
+        for rank, low in enumerate(ranks):
+            ranks[rank], value = torch.minimum(low, value), torch.maximum(low, value)
+        if len(ranks) < count:
+            ranks.append(value)
+    return ranks
+
+
 def third_lowest(values: Float[Tensor, "b k n *s"]) -> Float[Tensor, "b k *s"]:
-    """The third smallest over the third dimension: `kthvalue(3, 2)` by comparisons of whole rows, ten times as fast."""
-    first, *others = values.unbind(2)
-    lowest = [first]
-    for value in others:
-        for rank, low in enumerate(lowest):
-            lowest[rank], value = torch.minimum(low, value), torch.maximum(low, value)
-        if len(lowest) < 3:
-            lowest.append(value)
-    return lowest[-1]
+    """The third smallest over the third dimension."""
+    return lowest(values.movedim(2, 0), 3)[2]
 
 
 def smooth_over(value: Float[Tensor, "*b s"], mask: Bool[Tensor, "*b s"]) -> Float[Tensor, "*b s"]:
