@@ -15,6 +15,7 @@ from rmis_calib.pipeline.answer.estimation import estimate, raise_unless_trustwo
 from rmis_calib.pipeline.answer.guided_look import about_looks, expected_contours, look_along
 from rmis_calib.pipeline.answer.motion_names import MotionNames
 from rmis_calib.pipeline.answer.offsets import estimate_with_kinematics
+from rmis_calib.pipeline.answer.records.ends import with_unmeasured
 from rmis_calib.pipeline.answer.records.residuals import residual_of, residuals_px
 from rmis_calib.pipeline.answer.result import insufficient_data, make_result, motions_of
 from rmis_calib.pipeline.answer.rolling_shutter import with_rows_at_one_instant
@@ -338,5 +339,6 @@ def _solve(
     residuals = result.residuals | {
         f"head_{side}": residual_of(distance, "px", np.isfinite(distance)) for side, distance in (errors or {}).items()
     }
-    result = replace(result, residuals=residuals, head_point_error_px=summarise_head_points(errors))
+    ends = with_unmeasured(result.ends, views, told, choices)
+    result = replace(result, residuals=residuals, head_point_error_px=summarise_head_points(errors), ends=ends)
     return CalibrationRun(result, recording, views, told, poses, choices, observations, solution)

@@ -20,7 +20,7 @@ from rmis_calib.report.material import gather_material
 from rmis_calib.report.overlay_video import write_overlay_videos
 from rmis_calib.report.page import write_report
 from rmis_calib.results import CalibrationResult
-from rmis_calib.vision import FrameReason
+from rmis_calib.vision import EndKind, FrameReason
 
 OVERLAYS = 12
 """Overlays a camera that are written beside the report, unless told otherwise."""
@@ -29,6 +29,7 @@ LINE_COLUMNS = (
     "camera", "frame", "candidate", "found", "reason", "confidence", "direction_known",
     *(f"contour{edge}_{point}_{axis}" for edge in (0, 1) for point in ("rcm", "tip") for axis in "xy"),
     "sigma_contour0", "sigma_contour1", "end_x", "end_y", "sigma_end", "end_u_px", "end_v_px",
+    "end_kind", "end_sureness",
 )  # fmt: skip
 
 
@@ -132,5 +133,7 @@ def _line_rows(view: View) -> list[list[object]]:
             values = ["" if np.isnan(x) else f"{x:.9g}" for x in numbers[frame, candidate].tolist()]
             confidence = f"{float(found.confidence[frame, candidate]):.3f}"
             direction = int(found.direction_known[frame, candidate])
-            rows.append([view.side, frame, int(candidate), 1, "", confidence, direction, *values])
+            kind = EndKind(int(found.end_kind[frame, candidate])).name.lower()
+            sureness = f"{float(found.end_sureness[frame, candidate]):.3f}"
+            rows.append([view.side, frame, int(candidate), 1, "", confidence, direction, *values, kind, sureness])
     return rows

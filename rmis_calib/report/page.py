@@ -112,6 +112,7 @@ def render_report(
         edge_maps=material.edge_maps,
         picture_rows=details.picture_rows(result),
         residual_sizes=details.residual_sizes(result),
+        shaft_ends=details.shaft_ends(result),
         groups=details.groups(result),
         tests=details.residual_tests(result),
         head_point_errors=details.head_point_errors(result),

@@ -1,6 +1,7 @@
 """The parts of a result. Each is what its key in result.json holds; an unknown number is None, in an array NaN."""
 
 from collections import Counter
+from dataclasses import field
 from typing import Annotated
 
 import numpy as np
@@ -95,6 +96,9 @@ class ShaftEnds:
     """How far beyond the first place the second one lies, mm; null where there is one place only."""
     gap_sigma_mm: Number
     """1 sigma of it, mm; null likewise."""
+    not_measured: dict[str, int] = field(default_factory=dict)
+    """Shafts that were taken but whose end was not measured, by what they end at in the picture: `border` (they leave
+    it), `hidden` (something covers the end), or `unclear`. Only from `calibrate`."""
 
     @property
     def first_place(self) -> int:

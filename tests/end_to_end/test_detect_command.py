@@ -1,5 +1,6 @@
 """`rmis-calib detect`: lines, overlays, videos, sheets of the stages; masks of one's own, for `calibrate` too."""
 
+import csv
 import shutil
 import warnings
 from pathlib import Path
@@ -45,6 +46,16 @@ def test_overlay_videos_show_every_frame(recording: Path, tmp_path: Path) -> Non
         assert 0.001 < changed.float().mean() < 0.1
     assert sorted(p.name for p in (out / "overlays").iterdir()) == ["left_000000.jpg", "right_000000.jpg"]
     assert not (out / "debug").exists()
+
+
+def test_lines_say_what_every_shaft_ends_at(recording: Path, tmp_path: Path) -> None:
+    """Rendered shafts end at a metal wrist, in view of both cameras."""
+    assert main(["detect", str(recording), "--out", str(tmp_path / "out"), "--overlays", "0"]) == 0
+    with (tmp_path / "out" / "lines.csv").open(newline="") as file:
+        found = [row for row in csv.DictReader(file) if row["found"] == "1" and row["candidate"] == "0"]
+    assert len(found) == 8
+    assert {row["end_kind"] for row in found} == {"tube"}
+    assert all(0.5 < float(row["end_sureness"]) <= 1.0 for row in found)
 
 
 def test_sheets_of_stages(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

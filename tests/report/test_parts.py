@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from rmis_calib.geometry.rigid import RigidTransform, rigid_exp
 from rmis_calib.report.words.answer import covariance_text, inverse_covariance
-from rmis_calib.report.words.details import residual_tests, unknowns, unknowns_summary
+from rmis_calib.report.words.details import residual_tests, shaft_ends, unknowns, unknowns_summary
 from rmis_calib.report.words.directions import observability
 from rmis_calib.report.words.formatting import fixed, significant, with_sigma
 from rmis_calib.report.words.verdict import verdict
+from rmis_calib.results import EndCounts, ShaftEnds
 from rmis_calib.solver.observability import Direction, Observability
 
 
@@ -73,6 +74,31 @@ def test_unknowns_that_priors_hold_are_marked_and_counted(result_with) -> None:
         ("noise line", "0.500", False),
     ]
     assert unknowns_summary(rows) == "2 unknowns, 1 of them held by its prior, 1 level without a sigma"
+
+
+def test_every_measured_end_is_in_the_table_and_every_other_has_a_reason(rendered_run) -> None:
+    """Against the detections: what was taken, whether its end was measured, and what the detector says it ends at."""
+    taken = [c.candidate >= 0 for c in rendered_run.choices]
+    measured, other = 0, 0
+    for view, choice, is_taken in zip(rendered_run.views, rendered_run.choices, taken, strict=True):
+        for frame in rendered_run.told.frames[is_taken.numpy()]:
+            has_end = bool(view.detections.end_valid[frame, choice.candidate[rendered_run.told.frames == frame]])
+            measured, other = measured + has_end, other + (not has_end)
+    table = shaft_ends(rendered_run.result)
+    assert table is not None and measured > 20
+    assert sum(sum(counts) for _, counts in table.rows) == measured
+    assert sum(count for _, count in table.not_measured) == other
+
+
+def test_ends_at_two_places_are_told_apart_in_the_table(result_with) -> None:
+    kinds = {"ring": EndCounts(30, 2, 1), "tube": EndCounts(0, 9, 4)}
+    ends = ShaftEnds(by_kind=kinds, gap_mm=-9.03, gap_sigma_mm=0.06, not_measured={"border": 3, "hidden": 1})
+    table = shaft_ends(result_with(ends=ends))
+    assert table is not None
+    assert table.rows == (("ring that closes it", (30, 2, 1)), ("end of the dark tube", (0, 9, 4)))
+    assert table.gap == "9.030 ± 0.060 mm before"
+    assert table.not_measured == (("the shaft leaves the picture", 3), ("something covers the end", 1))
+    assert shaft_ends(result_with(ends=None)) is None
 
 
 def test_directions_are_ordered_and_placed_on_a_log_scale() -> None:

@@ -12,7 +12,7 @@ from rmis_calib.errors import InputError, OutputError, ShapeError
 from rmis_calib.geometry.rigid import RigidTransform
 from rmis_calib.report import Mark, Overlay, ReportMaterial, write_report
 from rmis_calib.report.drawing.rejections import RejectionSheet
-from rmis_calib.results import CalibrationResult, Motions
+from rmis_calib.results import CalibrationResult, EndCounts, Motions, ShaftEnds
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 MakeResult = Callable[..., CalibrationResult]
@@ -91,6 +91,14 @@ def test_page_states_the_answer_with_frames_units_and_uncertainty(
     assert "0.041 deg" in page.text
     assert "56 of 60" in page.text and "0.24 mm" in page.text
     assert "shaft_radius" in page.text and "4.011" in page.text
+
+
+def test_page_states_where_the_shaft_ends(result_with: MakeResult, page_of: Callable[..., Page]) -> None:
+    ends = ShaftEnds({"ring": EndCounts(30, 2, 1)}, gap_mm=9.03, gap_sigma_mm=0.06, not_measured={"hidden": 5})
+    text = page_of(result_with(ends=ends)).text
+    assert "ring that closes it" in text and "second place lies 9.030 ± 0.060 mm beyond the first one" in text
+    assert "Not measured: something covers the end (5)." in text
+    assert "Where the shaft's end was measured" not in page_of(result_with(ends=None)).text
 
 
 def test_per_axis_sigmas_are_the_roots_of_the_diagonal(result_with: MakeResult, page_of: Callable[..., Page]) -> None:

@@ -20,6 +20,12 @@ _MEASUREMENTS = {
 }
 
 
+_ENDS_AT = {"tube": "end of the dark tube", "ring": "ring that closes it", "unknown": "not told"}
+_NO_END = {
+    "border": "the shaft leaves the picture",
+    "hidden": "something covers the end",
+    "unclear": "no clear end",
+}
 _TESTED_KINDS = ("answer", "clock", "shift", "turn", "width", "taper", "end", "head")
 _TESTED_OVER = {
     MEAN: "mean",
@@ -92,6 +98,21 @@ class TestTable:
 
 
 @dataclass(frozen=True)
+class EndTable:
+    """Where shaft ends were measured.
+
+    Attributes:
+        rows: what they were taken for, with their number at the first place, at the second one, and left out.
+        gap: how far the second place lies beyond the first one or before it, with 1 sigma; empty where there is one.
+        not_measured: why other shafts have no measured end, and how many.
+    """
+
+    rows: tuple[tuple[str, tuple[int, int, int]], ...]
+    gap: str
+    not_measured: tuple[tuple[str, int], ...]
+
+
+@dataclass(frozen=True)
 class PictureRow:
     """What the pictures of one camera show along the predicted contours, px."""
 
@@ -146,6 +167,23 @@ def _size(kind: str, entry: Residual, result: CalibrationResult) -> SizeRow:
         rms=tiny_as_zero(entry.rms),
         robust_scale=tiny_as_zero(robust_scale(counted) if len(counted) else None),
     )
+
+
+def shaft_ends(result: CalibrationResult) -> EndTable | None:
+    """Where the shaft's end was measured, and what it ends at where it was not; None without ends."""
+    ends = result.ends
+    if ends is None:
+        return None
+    rows = tuple(
+        (_ENDS_AT[kind], (counts.first_place, counts.second_place, counts.left_out))
+        for kind, counts in ends.by_kind.items()
+    )
+    gap = ""
+    if ends.gap_mm is not None:
+        size, sigma = with_sigma(abs(ends.gap_mm), ends.gap_sigma_mm)
+        gap = f"{size} ± {sigma} mm {'beyond' if ends.gap_mm > 0 else 'before'}"
+    unseen = tuple((_NO_END[why], count) for why, count in ends.not_measured.items())
+    return EndTable(rows, gap, unseen)
 
 
 def groups(result: CalibrationResult) -> tuple[GroupRow, ...]:

@@ -1,7 +1,16 @@
 """Where along the instrument its shaft ends were measured, in a result and in words."""
 
+from collections import Counter
+from dataclasses import replace
+
+import torch
+
+from rmis_calib.pipeline.arms.poses import MotionPoses
+from rmis_calib.pipeline.motions.association import Choice
+from rmis_calib.pipeline.pictures.detection import View
 from rmis_calib.results import EndCounts, ShaftEnds
 from rmis_calib.solver import Solution
+from rmis_calib.vision import EndKind
 
 KINDS = ("unknown", "tube", "ring")
 """Kinds of end in the order of `Solution.ends`."""
@@ -20,6 +29,23 @@ def ends_of(solution: Solution) -> ShaftEnds | None:
         gap_mm=None if gap is None else float(gap.value),
         gap_sigma_mm=None if gap is None else float(gap.sigma),
     )
+
+
+def with_unmeasured(
+    ends: ShaftEnds | None, views: tuple[View, ...], poses: MotionPoses, choices: tuple[Choice, ...]
+) -> ShaftEnds | None:
+    """The record with the ends of the chosen shafts that no picture shows, by why not."""
+    if ends is None:
+        return None
+    counts: Counter[str] = Counter()
+    names = {int(EndKind.BORDER): "border", int(EndKind.HIDDEN): "hidden"}
+    for view, choice in zip(views, choices, strict=True):
+        found = view.at(poses.frames)
+        rows = torch.nonzero(choice.taken)[:, 0]
+        best = choice.candidate[rows]
+        kinds = found.end_kind[rows, best][~found.end_valid[rows, best]]
+        counts.update(names.get(kind, "unclear") for kind in kinds.tolist())
+    return replace(ends, not_measured=dict(sorted(counts.items())))
 
 
 def about_ends(solution: Solution) -> tuple[str, ...]:
