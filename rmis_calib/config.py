@@ -56,6 +56,10 @@ class CalibrationConfig:
     """Frames decoded, moved and detected together."""
     every: int = 1
     """Process every n-th frame; adjacent frames of a slow video add little."""
+    search_every: int = 8
+    """Search every n-th of these from the start, as a rule; the others only where both neighbours put the shafts. Where
+    these do not agree, or a shaft is not where it should be, each picture is searched. It changes lines by less than
+    their uncertainty. 1: search all from the start. With masks of your own all are."""
     masks: str | None = None
     """Use your own segmentation masks instead of colour detection: a folder of pictures in the order of the frames,
     white on shafts (for stereo two folders below it, `right` and `left`), or a TorchScript (.pt) or ONNX (.onnx) model
@@ -104,7 +108,7 @@ class CalibrationConfig:
             raise ValueError("cpu, cuda or cuda:N")
         return value
 
-    @field_validator("batch_size", "every", "min_motions")
+    @field_validator("batch_size", "every", "search_every", "min_motions")
     @classmethod
     def _positive(cls, value: int) -> int:
         if value < 1:

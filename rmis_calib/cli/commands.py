@@ -281,7 +281,15 @@ class Detect:
     """Most sheets of `--debug` a camera. Where there are more frames, only those without a shaft get one (-1: every
     frame gets one)."""
     settings: Settings = field(default_factory=CalibrationConfig)
-    uses: ClassVar[tuple[str, ...]] = ("device", "batch_size", "every", "masks", "mask_labels", "detector")
+    uses: ClassVar[tuple[str, ...]] = (
+        "device",
+        "batch_size",
+        "every",
+        "search_every",
+        "masks",
+        "mask_labels",
+        "detector",
+    )
 
     def run(self) -> int:
         from rmis_calib.io.description import read_description

@@ -39,11 +39,13 @@ class Header:
         detector: settings and camera, pickled; equal bytes are one detector.
         shape: (b, height, width) of the pictures; three bytes a pixel.
         new_buffer: bytes of the shared memory whose handle follows; 0: the one before.
+        contour_n: (b, k, 2, 3) where to look, as `ShaftDetector.look_near` takes it; None: everywhere.
     """
 
     detector: bytes
     shape: tuple[int, int, int]
     new_buffer: int
+    contour_n: np.ndarray | None = None
 
     @property
     def size(self) -> int:
@@ -51,9 +53,9 @@ class Header:
         return 3 * math.prod(self.shape)
 
     @property
-    def kind(self) -> tuple[bytes, tuple[int, ...]]:
+    def kind(self) -> tuple[bytes, tuple[int, ...], tuple[int, ...] | None]:
         """What pictures of one batch have in common."""
-        return self.detector, self.shape[1:]
+        return self.detector, self.shape[1:], None if self.contour_n is None else self.contour_n.shape[1:]
 
 
 @dataclass(eq=False)
@@ -171,7 +173,12 @@ def _found(requests: Sequence[_Request], detectors: dict[bytes, Any], device: st
         detectors[known] = ShaftDetector(settings, None if camera is None else camera.to(device=device))
     pictures = [request.pictures(device) for request in requests]
     joined = pictures[0] if len(pictures) == 1 else torch.cat(pictures)
-    found = detectors[known].detect(joined.permute(0, 3, 1, 2))  # channels stay last in memory, as they were decoded
+    images = joined.permute(0, 3, 1, 2)  # channels stay last in memory, as they were decoded
+    places = [header.contour_n for header in (request.header for request in requests) if header.contour_n is not None]
+    if places:
+        found = detectors[known].look_near(images, torch.from_numpy(np.concatenate(places)))
+    else:
+        found = detectors[known].detect(images)
     sizes = [len(part) for part in pictures]
     parts = {name: value.cpu().split(sizes) for name, value in vars(found).items()}
     return [{name: part[i].numpy() for name, part in parts.items()} for i in range(len(requests))]

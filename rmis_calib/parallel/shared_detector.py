@@ -6,6 +6,7 @@ import pickle
 import tempfile
 import threading
 import time
+from dataclasses import replace
 from multiprocessing.connection import Client, Connection
 from multiprocessing.reduction import send_handle
 
@@ -17,6 +18,7 @@ from rmis_calib.errors import DeviceError, ShapeError
 from rmis_calib.geometry import Camera
 from rmis_calib.parallel.device_service import Header, key_of_batch
 from rmis_calib.vision import DetectorSettings, ShaftDetections, ShaftDetector
+from rmis_calib.vision.detector import checked_places
 
 _ATTEMPTS = 3
 _PATIENCE_S = 120.0
@@ -24,7 +26,7 @@ _PATIENCE_S = 120.0
 
 
 class SharedDetector(ShaftDetector):
-    """As `ShaftDetector`, but `detect` leaves the search to the process that owns the device.
+    """As `ShaftDetector`, but `detect` and `look_near` leave the work to the process that owns the device.
 
     Pictures are on the CPU. Each thread that calls has one request under way, and one buffer.
     """
@@ -44,10 +46,22 @@ class SharedDetector(ShaftDetector):
         """
         if masks is not None:
             return super().detect(images, masks)
+        return self._sent(images, None)
+
+    def look_near(self, images: Tensor, contour_n: Tensor) -> ShaftDetections:
+        """See `ShaftDetector.look_near`.
+
+        Raises:
+            ShapeError, DeviceError, RuntimeError: as `detect`.
+        """
+        checked_places(contour_n, images)
+        return self._sent(images, contour_n.to("cpu", torch.float32).numpy())
+
+    def _sent(self, images: Tensor, contour_n: np.ndarray | None) -> ShaftDetections:
         self._check(images)
         if images.dtype != torch.uint8:
             raise ShapeError(where="images", expected="uint8, as they were decoded", found=images.dtype)
-        return self._service.search(self._pickled, images)
+        return self._service.search(self._pickled, images, contour_n)
 
 
 class SharedDevice:
@@ -67,8 +81,8 @@ class SharedDevice:
         """A detector of a camera's pictures."""
         return SharedDetector(self, settings, camera)
 
-    def search(self, detector: bytes, images: Tensor) -> ShaftDetections:
-        """Send uint8 pictures (b, 3, h, w), and wait for what was found in them.
+    def search(self, detector: bytes, images: Tensor, contour_n: np.ndarray | None = None) -> ShaftDetections:
+        """Send uint8 pictures (b, 3, h, w), and where to look in them, and wait for what was found.
 
         Raises:
             DeviceError, RuntimeError: see `SharedDetector.detect`.
@@ -77,7 +91,7 @@ class SharedDevice:
             line: _Line | None = getattr(self._of_thread, "line", None)
             try:
                 line = self._of_thread.line = line or _Line(self._address)
-                answer = line.ask(detector, images)
+                answer = line.ask(detector, images, contour_n)
                 break
             except (EOFError, OSError) as error:  # it died, or was killed; another one is being started
                 if line is not None:
@@ -99,12 +113,12 @@ class _Line:
         self._connection = _connected(address)
         self._memory: mmap.mmap | None = None
 
-    def ask(self, detector: bytes, images: Tensor) -> dict[str, np.ndarray] | str:
+    def ask(self, detector: bytes, images: Tensor, contour_n: np.ndarray | None) -> dict[str, np.ndarray] | str:
         count, _, height, width = images.shape
-        header = Header(detector, (count, height, width), 0)
+        header = Header(detector, (count, height, width), 0, contour_n)
         handle = None
         if self._memory is None or len(self._memory) < header.size:
-            header = Header(detector, header.shape, header.size)
+            header = replace(header, new_buffer=header.size)
             handle, self._memory = _shared_memory(header.size)
         shared = torch.frombuffer(self._memory, dtype=torch.uint8)
         shared[: header.size].view(count, height, width, 3).copy_(images.permute(0, 2, 3, 1))

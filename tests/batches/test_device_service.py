@@ -16,6 +16,7 @@ from data_synth import load_synth_config
 from data_synth.render import Renderer
 from data_synth.world import build_world
 from rmis_calib.errors import DeviceError, ShapeError
+from rmis_calib.geometry.lines import line_through_points
 from rmis_calib.parallel import shared_detector
 from rmis_calib.parallel.device_service import Header, _Line, _Request, device_services
 from rmis_calib.parallel.shared_detector import SharedDevice
@@ -81,6 +82,23 @@ def test_many_at_once_get_what_each_would_find_alone(address: str, pictures: tor
     assert all(map(same, together, alone * 2))
     with pytest.raises(ShapeError, match="uint8"):
         detector.detect(pictures.float() / 255.0)
+
+
+def test_places_to_look_at_travel_with_the_pictures(address: str, pictures: torch.Tensor) -> None:
+    detector = SharedDevice(address, "cpu").detector(DetectorSettings(), None)
+    xy = ShaftDetector().detect(pictures).contour_xy
+    places = line_through_points(xy[..., 0, :], xy[..., 1, :])
+    with ThreadPoolExecutor(6) as executor:  # searches, and looks at places, wait beside each other
+        searched = [executor.submit(detector.detect, pictures[i : i + 2]) for i in (0, 2)]
+        looked = [executor.submit(detector.look_near, pictures[i : i + 3], places[i : i + 3]) for i in (0, 2, 3, 1)]
+    assert all(
+        same(f.result(), ShaftDetector().detect(pictures[i : i + 2])) for f, i in zip(searched, (0, 2), strict=True)
+    )
+    alone = [ShaftDetector().look_near(pictures[i : i + 3], places[i : i + 3]) for i in (0, 2, 3, 1)]
+    assert bool(alone[0].valid.any())
+    assert all(same(f.result(), own) for f, own in zip(looked, alone, strict=True))
+    with pytest.raises(ShapeError, match="contour_n"):
+        detector.look_near(pictures, places[:2])
 
 
 def test_an_error_is_told_to_whom_it_belongs(address: str, pictures: torch.Tensor) -> None:

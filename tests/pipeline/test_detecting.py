@@ -28,12 +28,15 @@ def bars(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_every_picture_is_in_its_place(bars: Path) -> None:
+@pytest.mark.parametrize(
+    ("search_every", "told"), [(1, [(0, 7), (2, 7), (4, 7), (6, 7), (7, 7)]), (8, [(0, 7), (7, 7)])]
+)
+def test_every_picture_is_in_its_place(bars: Path, search_every: int, told: list[tuple[int, int]]) -> None:
     heard: list[tuple[int, int]] = []
     seen: list[int] = []
     table = detect(
         bars,
-        CalibrationConfig(batch_size=2),
+        CalibrationConfig(batch_size=2, search_every=search_every),
         lambda _, done, total: heard.append((done, total)),
         lambda batch: seen.extend(batch.frames.indices.tolist()),
     )
@@ -42,13 +45,13 @@ def test_every_picture_is_in_its_place(bars: Path) -> None:
     middle = found.axis_xy[:, 0, :, 1].mean(-1)
     expected = 99.5 + 6.0 * torch.arange(COUNT)
     torch.testing.assert_close(middle, expected, rtol=0, atol=0.1)  # px; measured 0.03
-    assert heard == [(0, 7), (2, 7), (4, 7), (6, 7), (7, 7)]
+    assert heard == told
     assert seen == list(range(COUNT))
 
 
 def test_thinning_leaves_frames_out_and_changes_no_other(bars: Path) -> None:
-    everything = detect(bars, CalibrationConfig(batch_size=1)).views[0].detections
-    table = detect(bars, CalibrationConfig(batch_size=1, every=3))
+    everything = detect(bars, CalibrationConfig(batch_size=1, search_every=1)).views[0].detections
+    table = detect(bars, CalibrationConfig(batch_size=1, search_every=1, every=3))
     thinned = table.views[0].detections
     for name, value in vars(thinned).items():
         torch.testing.assert_close(value[::3], getattr(everything, name)[::3], rtol=0, atol=0, equal_nan=True)

@@ -18,6 +18,7 @@ from rmis_calib.io import FrameBatch, FrameSource, Recording, load_recording, op
 from rmis_calib.pipeline.device import require_device
 from rmis_calib.pipeline.pictures.frozen import ChangeMeter
 from rmis_calib.pipeline.pictures.masks import MaskReader, open_masks
+from rmis_calib.pipeline.pictures.memory import detect_run, in_runs
 from rmis_calib.vision import DetectorSettings, EndKind, FrameReason, ShaftDetections, ShaftDetector
 from rmis_calib.vision.masks import Segmenter
 
@@ -221,7 +222,7 @@ def _detect_views(
 
         for camera, detector, batch in _take_turns(cameras, config, detectors, stack):
             masks = None if camera.masks is None else camera.masks(batch)
-            running.append((camera, detector, batch, masks, executor.submit(detector.detect, batch.images, masks)))
+            running.append((camera, detector, batch, masks, executor.submit(_detect, detector, batch, masks, config)))
             if len(running) > at_once:
                 finish_one()
         while running:
@@ -245,13 +246,24 @@ def _take_turns(
         batches = camera.source.batches(config.batch_size, device, config.every)
         stack.callback(batches.close)
         moved = None if camera.camera is None else camera.camera.to(dtype=torch.float64, device=device)
-        left.append((camera, detectors.make(config.detector, moved), batches))
+        remembers = camera.masks is None and config.search_every > 1
+        parts = in_runs(batches) if remembers else batches
+        left.append((camera, detectors.make(config.detector, moved), parts))
     while left:
         camera, detector, batches = left.popleft()
         batch = next(batches, None)
         if batch is not None:
             left.append((camera, detector, batches))
             yield camera, detector, batch
+
+
+def _detect(
+    detector: ShaftDetector, batch: FrameBatch, masks: Tensor | None, config: CalibrationConfig
+) -> ShaftDetections:
+    """Shafts of a batch, or of a run of consecutive pictures."""
+    if masks is not None or config.search_every == 1:
+        return detector.detect(batch.images, masks)
+    return detect_run(detector, batch.images, config.search_every, config.batch_size)
 
 
 @contextmanager

@@ -155,6 +155,20 @@ def between(lines: Float[Tensor, "b 2 3"], canvas: Canvas) -> Strips:
     )
 
 
+def listed_between(lines: Float[Tensor, "b k 2 3"], canvas: Canvas) -> tuple[Strips, Bool[Tensor, "b k"]]:
+    """As `between`, of several pairs of lines a picture: those that enclose a strip as one list, and which these are.
+
+    The list holds one at least, as an empty one has no medians: where none encloses a strip, one without a place.
+    """
+    count, most = lines.shape[:2]
+    each = between(lines.flatten(0, 1), canvas)
+    frame = torch.arange(count, device=lines.device).repeat_interleave(most)[:, None]
+    keep = each.valid.reshape(count, most).clone()
+    keep[0, 0] |= ~keep.any()
+    known = replace(each, frame=frame, origin=torch.nan_to_num(each.origin), along=torch.nan_to_num(each.along))
+    return known.listed(keep.reshape(-1, 1)), keep
+
+
 def pair(lines: HoughLines, picture: SmallPicture, settings: DetectorSettings, count: int) -> Strips:
     """Up to `count` most voted pairs of lines that could be the contours of one cylinder.
 
