@@ -58,12 +58,7 @@ def gradients(unlike: Float[Tensor, "b h w"]) -> tuple[Float[Tensor, "b h w"], F
 
 
 def thin(
-    magnitude: Float[Tensor, "b h w"],
-    frame: Int64[Tensor, " m"],
-    row: Int64[Tensor, " m"],
-    column: Int64[Tensor, " m"],
-    gu: Float[Tensor, " m"],
-    gv: Float[Tensor, " m"],
+    magnitude: Float[Tensor, "b h w"], pixel: Int64[Tensor, " m"], gu: Float[Tensor, " m"], gv: Float[Tensor, " m"]
 ) -> Bool[Tensor, " m"]:
     """Those of the listed pixels whose gradient is the largest along its own direction (of four).
 
@@ -71,18 +66,17 @@ def thin(
 
     Args:
         magnitude: of the gradient, at every pixel.
-        frame, row, column: the pixels.
+        pixel: the pixels' places in the flattened batch; none lies on the border of its picture.
         gu: gradient there.
         gv: gradient there.
     """
-    width = magnitude.shape[2] + 2
-    padded = pad(magnitude, (1, 1, 1, 1)).flatten()
-    at = (frame * (magnitude.shape[1] + 2) + row + 1) * width + column + 1
+    width = magnitude.shape[2]
     right = gv.abs() < 0.4142 * gu.abs()
     down = gu.abs() < 0.4142 * gv.abs()
     ahead = torch.where(right, 1, torch.where(down, width, torch.where(gu * gv > 0, width + 1, 1 - width)))
-    here = padded[at]
-    return (here >= padded[at + ahead]) & (here > padded[at - ahead])
+    flat = magnitude.flatten()
+    here, before, after = (flat.index_select(0, at) for at in (pixel, pixel - ahead, pixel + ahead))
+    return (here >= after) & (here > before)
 
 
 def vote(edges: EdgePixels, frames: int, radius_px: float) -> Float[Tensor, "b angles rhos"]:
@@ -116,11 +110,12 @@ def peaks(votes: Float[Tensor, "b angles rhos"], count: int) -> HoughLines:
     frames, angles, rhos = votes.shape
     around = torch.cat([votes[:, -3:], votes, votes[:, :3]], 1)  # the angle closes on itself
     sides = pad(around, (1, 1))
-    rows = sides[:, :, :-2] + sides[:, :, 1:-1] + sides[:, :, 2:]
-    smooth = (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:])[:, 2:-2] * (1 / 9)
+    rows = (sides[:, :, :-2] + sides[:, :, 1:-1]).add_(sides[:, :, 2:])
+    smooth = (rows[:, :-2] + rows[:, 1:-1]).add_(rows[:, 2:])[:, 2:-2].mul_(1 / 9)
     wide = torch.cat([smooth[:, -2:], smooth, smooth[:, :2]], 1)
     tops = pad(_window_max(wide, 2, 1), (2, 2))
-    score = torch.where(smooth >= _window_max(tops, 2, 2), smooth, 0.0)
+    # A comparison written as numbers takes a quarter of the time of one written as booleans.
+    score = torch.ge(smooth, _window_max(tops, 2, 2), out=torch.empty_like(smooth)).mul_(smooth)
     best = score.reshape(frames, -1).topk(count, dim=1)
     angle, rho = best.indices // rhos, best.indices % rhos
     flat = smooth.reshape(frames, -1)
@@ -140,16 +135,18 @@ def refine(edges: EdgePixels, lines: HoughLines) -> HoughLines:
     Other edges that a line crosses point elsewhere and do not pull at it.
     """
     frames, count = lines.rho.shape
-    # Every edge against every line of its frame, as two small matrix products; rows pad frames with fewer edges.
+    # Every edge against every line of its frame, as one small matrix product; rows of infinities pad frames
+    # with fewer edges.
     size = torch.bincount(edges.frame, minlength=frames)
     first = size.cumsum(0) - size
     row = torch.arange(len(edges.frame), device=edges.frame.device) - first[edges.frame]
-    place = edges.uv.new_zeros(frames, max(1, int(size.max())), 5)
-    place[edges.frame, row] = torch.cat([edges.uv, -torch.ones_like(edges.uv[:, :1]), edges.normal], -1)
-    across = place[..., :3] @ torch.cat([lines.normal, lines.rho[..., None]], -1).mT  # (b, rows, p)
-    agreement = place[..., 3:] @ lines.normal.mT
-    frame, row, line = ((across.abs() < _GATE_PX) & (agreement > _AGREEMENT)).nonzero(as_tuple=True)  # few
+    place = edges.uv.new_full((frames, max(1, int(size.max())), 3), torch.inf)
+    place[edges.frame, row] = torch.cat([edges.uv, -torch.ones_like(edges.uv[:, :1])], -1)
+    across = place @ torch.cat([lines.normal, lines.rho[..., None]], -1).mT  # (b, rows, p)
+    frame, row, line = (across.abs() < _GATE_PX).nonzero(as_tuple=True)
     edge, normal = first[frame] + row, lines.normal[frame, line]
+    agree = ((edges.normal[edge] * normal).sum(-1) > _AGREEMENT).nonzero()[:, 0]  # few
+    frame, row, line, edge, normal = (value[agree] for value in (frame, row, line, edge, normal))
     t = edges.uv[edge, 1] * normal[:, 0] - edges.uv[edge, 0] * normal[:, 1]
     y, weight = across[frame, row, line], edges.weight[edge]
     moments = torch.stack([weight, weight * t, weight * y, weight * t * t, weight * t * y], -1)
@@ -166,9 +163,9 @@ def refine(edges: EdgePixels, lines: HoughLines) -> HoughLines:
 def _window_max(values: Float[Tensor, "b h w"], reach: int, dim: int) -> Float[Tensor, "b h2 w2"]:
     """Maximum over 2 * reach + 1 neighbours along one dimension, which shrinks by 2 * reach."""
     length = values.shape[dim] - 2 * reach
-    highest = values.narrow(dim, 0, length)
-    for shift in range(1, 2 * reach + 1):
-        highest = torch.maximum(highest, values.narrow(dim, shift, length))
+    highest = torch.maximum(values.narrow(dim, 0, length), values.narrow(dim, 1, length))
+    for shift in range(2, 2 * reach + 1):
+        torch.maximum(highest, values.narrow(dim, shift, length), out=highest)
     return highest
 
 

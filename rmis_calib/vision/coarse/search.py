@@ -217,15 +217,19 @@ def _edges(
 ) -> tuple[Bool[Tensor, "b h w"], hough.EdgePixels]:
     """Thin ridges of the gradient inside the field of view, in small pixels from the middle of the canvas."""
     gu, gv = hough.gradients(unlike)
-    magnitude = torch.sqrt(gu * gu + gv * gv)
-    strong = ((magnitude > _MIN_GRADIENT) & well_inside).flatten().nonzero()[:, 0]
-    height, width = unlike.shape[1:]
-    frame, row, column = strong // (height * width), strong // width % height, strong % width
-    gradient = torch.stack([gu.flatten()[strong], gv.flatten()[strong]], -1)
-    top = hough.thin(magnitude, frame, row, column, *gradient.unbind(-1)).nonzero()[:, 0]
+    magnitude = (gu * gu).addcmul_(gv, gv).sqrt_()
+    strong = (magnitude > _MIN_GRADIENT) & well_inside
+    for border in (strong[:, :: strong.shape[1] - 1], strong[:, :, :: strong.shape[2] - 1]):
+        border.fill_(False)
+    pixel = strong.flatten().nonzero()[:, 0]
+    gu, gv = (component.flatten().index_select(0, pixel) for component in (gu, gv))
+    top = hough.thin(magnitude, pixel, gu, gv).nonzero()[:, 0]
+    pixel, gradient = pixel[top], torch.stack([gu[top], gv[top]], -1)
     ridge = torch.zeros_like(well_inside)
-    ridge.view(-1)[strong[top]] = True
-    strength = magnitude.flatten()[strong[top]]
+    ridge.view(-1)[pixel] = True
+    strength = magnitude.flatten()[pixel]
+    height, width = unlike.shape[1:]
+    frame, row, column = pixel // (height * width), pixel // width % height, pixel % width
     middle = strength.new_tensor([(width - 1) / 2, (height - 1) / 2])
-    uv = torch.stack([column[top], row[top]], -1).to(strength.dtype) - middle
-    return ridge, hough.EdgePixels(frame[top], uv, gradient[top] / strength[:, None], strength / (strength + 0.15))
+    uv = torch.stack([column, row], -1).to(strength.dtype) - middle
+    return ridge, hough.EdgePixels(frame, uv, gradient / strength[:, None], strength / (strength + 0.15))

@@ -58,11 +58,11 @@ def straighten_pictures(
     u, v = place.unbind(-1)
     u, v = torch.nan_to_num(u), torch.nan_to_num(v)
     inside = (u > -0.5) & (v > -0.5) & (u < breadth - 0.5) & (v < height - 0.5)
-    layers = torch.cat([rgb, seen[:, None]], 1).movedim(0, 1)
-    read = sample_frames(layers, picture, u, v).reshape(4, -1, ACROSS, ALONG)
-    known = (inside.reshape(-1, ACROSS, ALONG) & (read[3] > 0.75)).to(rgb.dtype)
+    colour = sample_frames(rgb.movedim(0, 1), picture, u, v).reshape(3, -1, ACROSS, ALONG)
+    field = sample_frames(seen[None], picture, u, v).reshape(-1, ACROSS, ALONG)
+    known = (inside.reshape(field.shape) & (field > 0.75)).to(rgb.dtype)
     columns = width.mean(-1) * (ALONG - 1) / (ends[..., 1] - ends[..., 0]).clamp(min=1.0)
-    return channels(read[:3].movedim(0, 1), known, columns.flatten()), ends
+    return channels(colour.movedim(0, 1), known, columns.flatten()), ends
 
 
 def channels(

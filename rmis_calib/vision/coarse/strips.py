@@ -47,25 +47,47 @@ class SmallPicture:
         self, strips: "Strips", t: Float[Tensor, "b k *#points"], y: Float[Tensor, "b k *#points"]
     ) -> tuple[Float[Tensor, "b k *points"], Bool[Tensor, "b k *points"], Float[Tensor, "b k *points"]]:
         """Unlikeness at (station, lateral) pairs, whether they lie in the field of view, and log brightness."""
-        height, width = self.canvas.size
-        ones = [1] * (max(t.ndim, y.ndim) - 2)
+        place = self._place(strips, t, y)
+        unlike, field, tone = sample_frames(self.layers, strips.frame, *place)
+        return unlike, self._seen(field, *place), tone
+
+    def read_contrast(
+        self, strips: "Strips", t: Float[Tensor, "b k *#points"], y: Float[Tensor, "b k *#points"]
+    ) -> tuple[Float[Tensor, "b k *points"], Bool[Tensor, "b k *points"]]:
+        """The first two of `read`."""
+        place = self._place(strips, t, y)
+        unlike, field = sample_frames(self.layers[:2], strips.frame, *place)
+        return unlike, self._seen(field, *place)
+
+    def read_brightness(
+        self, strips: "Strips", t: Float[Tensor, "b k *#points"], y: Float[Tensor, "b k *#points"]
+    ) -> Float[Tensor, "b k *points"]:
+        """The last of `read`."""
+        return sample_frames(self.layers[2:], strips.frame, *self._place(strips, t, y))[0]
+
+    def _place(
+        self, strips: "Strips", t: Float[Tensor, "b k *#points"], y: Float[Tensor, "b k *#points"]
+    ) -> tuple[Float[Tensor, "b k *points"], Float[Tensor, "b k *points"]]:
+        """Small pixel coordinates of (station, lateral) pairs."""
+        shape = (*strips.frame.shape, *[1] * (max(t.ndim, y.ndim) - 2))
         first = (strips.origin - strips.origin.new_tensor(self.canvas.origin)) / self.factor
+        axes = (first, strips.along / self.factor, strips.left / self.factor)
         u, v = (
-            torch.addcmul(
-                torch.addcmul(origin.reshape(*origin.shape, *ones), t, along.reshape(*origin.shape, *ones)),
-                y,
-                left.reshape(*origin.shape, *ones),
-            )
+            torch.addcmul(torch.addcmul(origin, t, along), y, left)
             for origin, along, left in zip(
-                first.unbind(-1),
-                (strips.along / self.factor).unbind(-1),
-                (strips.left / self.factor).unbind(-1),
-                strict=True,
+                *([value.reshape(shape) for value in axis.unbind(-1)] for axis in axes), strict=True
             )
         )
-        near = (u >= -0.5) & (v >= -0.5) & (u <= width - 0.5) & (v <= height - 0.5)
-        unlike, field, tone = sample_frames(self.layers, strips.frame, u, v)
-        return unlike, (field > 0.75).logical_and_(near), tone
+        return u, v
+
+    def _seen(
+        self, field: Float[Tensor, "b k *points"], u: Float[Tensor, "b k *points"], v: Float[Tensor, "b k *points"]
+    ) -> Bool[Tensor, "b k *points"]:
+        """Whether places lie in the field of view, and in the picture."""
+        height, width = self.canvas.size
+        near_u = (u - 0.5 * (width - 1)).abs_() <= 0.5 * width
+        near_v = (v - 0.5 * (height - 1)).abs_() <= 0.5 * height
+        return (field > 0.75).logical_and_(near_u).logical_and_(near_v)
 
 
 @dataclass(frozen=True, eq=False)

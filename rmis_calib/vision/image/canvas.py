@@ -108,4 +108,5 @@ def shrink(images: Tensor, factor: int) -> Float[Tensor, "b c h w"]:
         cut = cut.to(torch.float32)
     if factor > 1:
         cut = interpolate(cut, size=size, mode="bilinear", antialias=True)
-    return cut.to(torch.float32, memory_format=torch.contiguous_format).round_().mul_(1.0 / 255.0)
+    small = cut.to(torch.float32, memory_format=torch.contiguous_format)
+    return (small if cut.dtype == torch.uint8 else small.round_()).mul_(1.0 / 255.0)

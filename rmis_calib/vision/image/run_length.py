@@ -53,9 +53,8 @@ def run_range(value: Float[Tensor, "*b s"]) -> Float[Tensor, "*b s"]:
 
 
 def _run_labels(on: Bool[Tensor, "*b s"]) -> Tensor:
-    """Number of the latest run begun at or before each station, from 1; 0 before the first."""
-    starts = on & ~torch.cat([torch.zeros_like(on[..., :1]), on[..., :-1]], -1)
-    return starts.cumsum(-1)
+    """A number for every station, the same for all of one run: how many stations before it are off."""
+    return (~on).cumsum(-1)
 
 
 def masked_mean(value: Float[Tensor, "*b s"], mask: Bool[Tensor, "*b s"]) -> Float[Tensor, "*b"]:
@@ -75,14 +74,12 @@ def masked_quantile(value: Float[Tensor, "*b s"], mask: Bool[Tensor, "*b s"], sh
 
 def first_on(t: Float[Tensor, " s"], mask: Bool[Tensor, "*b s"]) -> Float[Tensor, "*b"]:
     """Lowest station in the mask; 0 where there is none."""
-    low = torch.where(mask, t, torch.inf).amin(-1)
-    return torch.where(torch.isfinite(low), low, 0.0)
+    return torch.where(mask, t, torch.inf).amin(-1).nan_to_num_(posinf=0.0)
 
 
 def last_on(t: Float[Tensor, " s"], mask: Bool[Tensor, "*b s"]) -> Float[Tensor, "*b"]:
     """Highest station in the mask; 0 where there is none."""
-    high = torch.where(mask, t, -torch.inf).amax(-1)
-    return torch.where(torch.isfinite(high), high, 0.0)
+    return torch.where(mask, t, -torch.inf).amax(-1).nan_to_num_(neginf=0.0)
 
 
 def lowest(values: Float[Tensor, "n *b s"], count: int) -> list[Float[Tensor, "*b s"]]:
