@@ -8,6 +8,7 @@ fraction of the time.
 import importlib
 import threading
 from collections.abc import Callable
+from dataclasses import is_dataclass
 from enum import Enum
 from functools import cached_property, partial, update_wrapper, wraps
 from types import CodeType, FunctionType
@@ -21,7 +22,8 @@ LONGEST = 16
 """Calls with longer collections are checked each time: beartype looks at one entry, drawn at random."""
 LIBRARIES = ("kornia", "matplotlib.pyplot", "pydantic.dataclasses", "rich.progress", "scipy.stats")
 """Imported beforehand: while jaxtyping's hook imports a module, Python finds no compiled file of what that imports."""
-PLAIN = frozenset((int, float, complex, type(None)))
+TENSORS, ONE_BY_ONE = (torch.Tensor, np.ndarray), (str, bool, Enum, type)
+COLLECTIONS = (tuple, list, set, frozenset, dict)
 
 _jaxtyped = jaxtyping.jaxtyped
 _thread = threading.local()
@@ -65,11 +67,22 @@ def once_a_shape(function: Any = None, *, typechecker: Callable) -> Any:
     """Like `jaxtyping.jaxtyped`."""
     if function is None:
         return partial(once_a_shape, typechecker=typechecker)
+    if (
+        isinstance(function, type)
+        and is_dataclass(function)
+        and isinstance(vars(function).get("__init__"), FunctionType)
+    ):
+        # Equal fields make equal code, whatever their types: no two classes share a signature.
+        function.__init__ = _checked_once(function.__init__, _Signature(function.__init__, typechecker))
+        return function
     if not isinstance(function, FunctionType):
         return _jaxtyped(function, typechecker=typechecker)
     if function.__code__ not in _signatures:
         _signatures[function.__code__] = _Signature(function, typechecker)
-    signature = _signatures[function.__code__]
+    return _checked_once(function, _signatures[function.__code__])
+
+
+def _checked_once(function: FunctionType, signature: _Signature) -> Callable:
     passed = signature.passed
 
     @wraps(function)
@@ -105,17 +118,24 @@ class _Unknown(Exception):
     """A value that no key describes."""
 
 
+_told_by_type: set[type] = {int, float, complex, type(None)}
+"""Types whose values a check does not look into; those of the package join them as they are met."""
+
+
 def _kind(value: Any) -> Any:
     kind = type(value)
-    if kind in PLAIN:
+    if kind is torch.Tensor:  # by far the most
+        return value.dtype, value.shape
+    if kind in _told_by_type:
         return kind
-    if isinstance(value, torch.Tensor | np.ndarray):
+    if isinstance(value, TENSORS):
         return kind, value.dtype, tuple(value.shape)
-    if isinstance(value, str | bool | Enum | type):
+    if isinstance(value, ONE_BY_ONE):
         return kind, value
-    if isinstance(value, tuple | list | set | frozenset | dict):
+    if isinstance(value, COLLECTIONS):
         if len(value) > LONGEST:
             raise _Unknown
         items = value.items() if isinstance(value, dict) else value
         return kind, tuple([_kind(item) for item in items])
+    _told_by_type.add(kind)
     return kind

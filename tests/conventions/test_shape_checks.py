@@ -1,5 +1,7 @@
 """Calls into the package are checked against their signatures in every test, also where a like call has passed."""
 
+from dataclasses import dataclass
+
 import pytest
 import torch
 from beartype import beartype
@@ -19,9 +21,29 @@ def test_a_wrong_argument_is_refused_before_and_after_a_right_one() -> None:
         assert rotvec_to_matrix(torch.zeros(2, 3)).shape == (2, 3, 3)
 
 
-def test_a_wrong_field_is_refused() -> None:
-    with pytest.raises(TypeCheckError):
-        RigidTransform("camera_right", 3, torch.eye(4))
+def test_a_wrong_field_is_refused_before_and_after_a_right_one() -> None:
+    for _ in range(2):
+        with pytest.raises(TypeCheckError):
+            RigidTransform("camera_right", 3, torch.eye(4))
+        assert RigidTransform("camera_right", "arm", torch.eye(4)).src == "arm"
+
+
+def test_classes_with_equal_names_of_fields_are_told_apart() -> None:
+    @once_a_shape(typechecker=beartype)
+    @dataclass(frozen=True)
+    class Two:
+        x: Float[Tensor, "2"]
+
+    @once_a_shape(typechecker=beartype)
+    @dataclass(frozen=True)
+    class Three:
+        x: Float[Tensor, "3"]
+
+    for _ in range(2):
+        assert Two(torch.zeros(2)).x.shape == (2,) and Three(x=torch.zeros(3)).x.shape == (3,)
+        for wrong, size in ((Two, 3), (Three, 2)):
+            with pytest.raises(TypeCheckError, match="x"):
+                wrong(torch.zeros(size))
 
 
 def test_a_wrong_answer_to_arguments_that_have_passed_is_refused() -> None:
