@@ -7,6 +7,21 @@ from torch import Tensor
 from rmis_calib.vision.image.run_length import bridge, first_on, last_on, run_any
 
 
+def reached_borders(
+    t: Float[Tensor, " s"], run: Bool[Tensor, "*b s"], seen: Bool[Tensor, "*b s"], width: Float[Tensor, "*b"]
+) -> tuple[Bool[Tensor, "*b"], Bool[Tensor, "*b"]]:
+    """Whether a stretch comes within half a width of where the field of view begins, and of where it ends.
+
+    Args:
+        t: stations, evenly spaced.
+        run: those of the stretch.
+        seen: those in the field of view.
+        width: of the strip, in the unit of the stations.
+    """
+    reach = 0.5 * width + 3 * (t[1] - t[0])
+    return first_on(t, run) - first_on(t, seen) < reach, last_on(t, seen) - last_on(t, run) < reach
+
+
 def enter(
     t: Float[Tensor, " s"],
     edged: Bool[Tensor, "b k s"],
@@ -21,9 +36,7 @@ def enter(
     """
     step = t[1] - t[0]
     contoured = edged & run_any(bridge(edged, 0.7 * width / step), main)
-    reach = 0.5 * width + 3 * step
-    low = first_on(t, contoured) - first_on(t, seen) < reach
-    high = last_on(t, seen) - last_on(t, contoured) < reach
+    low, high = reached_borders(t, contoured, seen, width)
     before = contoured & (t < first_on(t, main)[..., None]) & (low & ~high)[..., None]
     after = contoured & (t > last_on(t, main)[..., None]) & (high & ~low)[..., None]
     return before | after, (low, high)

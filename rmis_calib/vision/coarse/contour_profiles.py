@@ -11,6 +11,7 @@ from rmis_calib.vision.coarse.strips import SmallPicture, Strips
 from rmis_calib.vision.image.run_length import third_lowest
 
 _OFFSETS = 9
+_STATIONS = 160
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,3 +78,52 @@ def read_middle(
     inner, brightness, tint = (third_lowest(layer[:, :, :7]) for layer in (value, tone, tint))
     far = torch.where(seen[:, :, 7:], value[:, :, 7:], torch.inf).amin(2)
     return AxisProfile(inner, far, brightness, tint, seen[:, :, 3])
+
+
+@dataclass(frozen=True, eq=False)
+class StripProfiles:
+    """All that is read of strips, from end to end of the canvas."""
+
+    t: Float[Tensor, " s"]
+    """Stations, px."""
+    sides: ContourProfiles
+    middle: AxisProfile
+    lit: Bool[Tensor, "b k"]
+    """Which strips are seen in the lit view."""
+    span: Float[Tensor, "b k s"]
+    """Distance of the contours, px."""
+    step: Float[Tensor, "b k s"]
+    """Rise across the weaker contour in view; infinite where none is."""
+    outer: Float[Tensor, "b k s"]
+    """Unlikeness outside of the contour in view that has less of it; infinite where none is."""
+
+    @property
+    def spacing(self) -> float:
+        """From station to station, px."""
+        return float(self.t[1] - self.t[0])
+
+    @property
+    def seen(self) -> Bool[Tensor, "b k s"]:
+        """Whether the middle is in the field of view."""
+        return self.middle.seen
+
+    @property
+    def brighter(self) -> Float[Tensor, "b k s"]:
+        """How much brighter the inside is than both sides, log brightness."""
+        return self.middle.brightness - self.sides.brightness.mean(2)
+
+
+def read_profiles(picture: SmallPicture, strips: Strips) -> StripProfiles:
+    """Both contours and what lies between them, at stations."""
+    t = torch.linspace(-1, 1, _STATIONS, device=strips.offset.device) * picture.half_diagonal_px
+    stations = t.expand(*strips.valid.shape, _STATIONS)
+    sides = follow(picture, strips, stations)
+    return StripProfiles(
+        t=t,
+        sides=sides,
+        middle=read_middle(picture, strips, stations, sides),
+        lit=picture.lit(strips),
+        span=sides.lateral[:, :, 0] - sides.lateral[:, :, 1],
+        step=torch.where(sides.seen, sides.rise, torch.inf).amin(2),
+        outer=torch.where(sides.seen, sides.outer, torch.inf).amin(2),
+    )

@@ -5,7 +5,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from rmis_calib.vision.image.run_length import first_on, last_on, longest_run, lowest
+from rmis_calib.vision.coarse.borders import reached_borders
+from rmis_calib.vision.image.run_length import longest_run, lowest
 
 # Log brightness: metal is two to three times as bright as the shaft before it (0.7 to 1.1) on the rendered pictures,
 # and half of that in the da Vinci and grasper frames; light along a shaft changes by less over a width.
@@ -44,9 +45,7 @@ def between_wrists(
     rise, fall = rise - torch.minimum(left, right).clamp(min=0.0), -rise + torch.maximum(left, right).clamp(max=0.0)
     tinted = tinted.abs() > _RISE
     run = longest_run(on, 0.7 * width)
-    reach = 0.5 * width + 3
-    low = first_on(place, run) - first_on(place, seen) < reach
-    high = last_on(place, seen) - last_on(place, run) < reach
+    low, high = reached_borders(place, run, seen, width)
     upwards = torch.where(low == high, rise.amax(-1) > fall.amax(-1), low)
     up, down = on & (rise > _RISE), on & (fall > _RISE)
     end, begin = _first_peak(rise + step, up, False), _first_peak(fall - step, down, True)
