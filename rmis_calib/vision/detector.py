@@ -15,6 +15,7 @@ from rmis_calib.vision.detections import EndKind, FrameReason, ShaftDetections, 
 from rmis_calib.vision.fine.expected import where_expected
 from rmis_calib.vision.fine.measurement import measure
 from rmis_calib.vision.image.canvas import Canvas, plan_canvas
+from rmis_calib.vision.image.picking import pick_pictures
 from rmis_calib.vision.image.pixel_mapping import Lens
 from rmis_calib.vision.masks import checked_masks
 from rmis_calib.vision.settings import DetectorSettings
@@ -66,7 +67,7 @@ class ShaftDetector:
         again = needs_second_pass(found, stages.leads[:, :_LEADS] / images.shape[-1], twice)
         if not bool(again.any()):
             return found
-        second, _ = self._look(images[again], None, broken[again], 2)
+        second, _ = self._look(pick_pictures(images, again), None, broken[again], 2)
         better = merge(found.of_frames(again), second, twice)
         for name, value in vars(found).items():
             value[again] = getattr(better, name)

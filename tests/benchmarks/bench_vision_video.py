@@ -1,10 +1,13 @@
 """Whole stereo video to lines, beside decoding alone: frames a second, their ratio, and peak memory over the length.
 
     python tests/benchmarks/bench_vision_video.py [--frames 1000 10000] [--preset mild] [--every 1 4]
+        [--search-every 8 1]
 
 A rendered smooth stereo video is repeated packet by packet to the length asked for (so there is a cut every 60 pairs).
 Each row is a process of its own; a frame is one picture, so a stereo pair counts twice. Decoding alone reads both
-videos side by side, each in its own thread, to RGB tensors, as detection does.
+videos side by side, each in its own thread, to RGB tensors, as detection does. `--search-every 1` searches every frame
+from the start, 8 every eighth or so (rmis_calib/pipeline/pictures/memory.py). Shares of decoding alone: of its pictures
+a second, and of its processor time, which other programs on the machine do not change.
 """
 
 import argparse
@@ -81,7 +84,8 @@ def run_one(task: str, path: Path) -> None:
     if task == "decode":
         count = decode(path)
     else:
-        table = detect(path, CalibrationConfig(every=int(task)))
+        every, search_every = map(int, task.split("/"))
+        table = detect(path, CalibrationConfig(every=every, search_every=search_every))
         count = sum(len(view.found) for view in table.views)
     spent, busy = time.perf_counter() - began, time.process_time() - cpu
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
@@ -98,26 +102,36 @@ def main() -> None:
     parser.add_argument("--frames", type=int, nargs="+", default=[1000, 10000], help="pictures, both cameras together")
     parser.add_argument("--preset", default="mild")
     parser.add_argument("--every", type=int, nargs="+", default=[1, 4], help="search every n-th frame")
-    parser.add_argument("--task", help="decode, or the n of every n-th frame searched; for this script's own processes")
+    parser.add_argument("--search-every", type=int, nargs="+", default=[8, 1], help="from the start")
+    parser.add_argument("--task", help="decode, or both numbers; for this script's own processes")
     parser.add_argument("--path", type=Path)
     options = parser.parse_args()
     if options.task:
         run_one(options.task, options.path)
         return
     print(f"{options.preset}, {torch.get_num_threads()} threads, torch {torch.__version__}")
-    print(
-        "| pictures | task | pictures / s | processor ms a picture | peak memory, MB |\n| --- | --- | --- | --- | --- |"
+    names = (
+        "pictures",
+        "task",
+        "pictures / s",
+        "of decoding",
+        "processor ms a picture",
+        "of decoding",
+        "peak memory, MB",
     )
+    print("| " + " | ".join(names) + " |\n|" + " --- |" * len(names))
     with tempfile.TemporaryDirectory() as folder:
         for frames in options.frames:
             path = make_recording(Path(folder), options.preset, frames // 2)
-            alone = 0.0
-            for task in ("decode", *(str(n) for n in options.every)):
+            alone = alone_busy = 0.0
+            for task in ("decode", *(f"{n}/{m}" for n in options.every for m in options.search_every)):
                 count, spent, busy, peak = measure(task, path)
-                alone = alone or spent
-                name = "decoding alone" if task == "decode" else f"lines, every {task}"
-                speed = f"{count / spent:.0f} | {100 * alone / spent:.0f} %"
-                print(f"| {count:.0f} | {name} | {speed} | {1e3 * busy / count:.2f} | {peak:.0f} |", flush=True)
+                alone, alone_busy = alone or spent, alone_busy or busy
+                every, _, search_every = task.partition("/")
+                name = "decoding alone" if task == "decode" else f"lines, every {every}, searched every {search_every}"
+                share, share_busy = (f"{100 * a / b:.0f} %" for a, b in ((alone, spent), (alone_busy, busy)))
+                cells = (f"{count:.0f}", name, f"{count / spent:.0f}", share, f"{1e3 * busy / count:.2f}", share_busy)
+                print("| " + " | ".join(cells) + f" | {peak:.0f} |", flush=True)
 
 
 if __name__ == "__main__":
