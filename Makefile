@@ -17,7 +17,7 @@ demo: $(STAMP)  ## render a stereo recording, calibrate it, leave demo_output/re
 	$(BIN)/rmis-calib demo --out demo_output --overwrite
 
 test: $(STAMP)  ## every test, the import contracts and the documentation's Python
-	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n auto --dist loadfile
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n auto --dist loadfile --no-loadscope-reorder
 
 lint: $(STAMP)  ## ruff and pyright
 	$(BIN)/ruff format --check .

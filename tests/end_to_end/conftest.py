@@ -24,8 +24,10 @@ def recording(rendered_pairs, tmp_path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def demo_output(tmp_path_factory):
+def demo_output(made_once) -> Path:
     """`rmis-calib demo` as `make demo` runs it: 60 motions, stereo, 640x480, 0.1 mm / 0.03 deg of kinematic noise."""
-    out = tmp_path_factory.mktemp("demo") / "demo_output"
-    assert main(["demo", "--out", str(out)]) == 0
-    return out
+
+    def make(folder: Path) -> None:
+        assert main(["demo", "--out", str(folder / "demo_output")]) == 0
+
+    return made_once("demo", make) / "demo_output"

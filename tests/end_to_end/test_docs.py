@@ -2,6 +2,7 @@
 links lead somewhere. Blocks marked `py` instead of `python` need machines that tests do not have."""
 
 import re
+import shutil
 from pathlib import Path
 from types import ModuleType
 
@@ -26,10 +27,16 @@ LINKS = [
 ]
 
 
+@pytest.fixture(scope="module")
+def beside_a_demo(demo_output, tmp_path_factory):
+    """A folder with a demo that the pages' Python may write into."""
+    return shutil.copytree(demo_output, tmp_path_factory.mktemp("pages") / "demo_output").parent
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("block", BLOCKS)
-def test_python_on_the_pages_runs(block, demo_output, monkeypatch):
-    monkeypatch.chdir(demo_output.parent)
+def test_python_on_the_pages_runs(block, beside_a_demo, monkeypatch):
+    monkeypatch.chdir(beside_a_demo)
     exec(compile(block, "a page's block", "exec"), {"__name__": "page"})
 
 

@@ -42,6 +42,7 @@ def changed(config, changes):
     return config
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", sorted(CASES))
 def test_the_same_numbers_from_the_file_as_from_the_calibration(case, tmp_path) -> None:
     scene, unknowns = CASES[case]

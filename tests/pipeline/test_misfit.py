@@ -101,6 +101,7 @@ def edited_joints(folder, change) -> None:
         csv.writer(file).writerows([header, *rows])
 
 
+@pytest.mark.slow
 def test_a_wrong_clock_is_called_a_wrong_clock(smooth, tmp_path) -> None:
     folder = shutil.copytree(smooth, tmp_path / "recording")
     description = yaml.safe_load((folder / "recording.yaml").read_text())
@@ -115,6 +116,7 @@ def test_a_wrong_clock_is_called_a_wrong_clock(smooth, tmp_path) -> None:
     assert found.motions.used.all()
 
 
+@pytest.mark.slow
 def test_swapped_cameras_are_called_swapped(smooth, tmp_path) -> None:
     folder = shutil.copytree(smooth, tmp_path / "recording")
     (folder / "right").rename(folder / "other")
@@ -125,6 +127,7 @@ def test_swapped_cameras_are_called_swapped(smooth, tmp_path) -> None:
     assert result.message.partition("Likely: ")[2].startswith("the left and the right pictures look swapped")
 
 
+@pytest.mark.slow
 def test_a_joint_of_the_wrong_sign_is_a_misfit(smooth, tmp_path) -> None:
     folder = shutil.copytree(smooth, tmp_path / "recording")
 
@@ -137,6 +140,7 @@ def test_a_joint_of_the_wrong_sign_is_a_misfit(smooth, tmp_path) -> None:
     assert not result.trustworthy and "pictures and joints do not fit each other" in result.message
 
 
+@pytest.mark.slow
 def test_frozen_pictures_are_left_out_and_said(smooth, tmp_path) -> None:
     folder = shutil.copytree(smooth, tmp_path / "recording")
     for side in ("right", "left"):
@@ -151,6 +155,7 @@ def test_frozen_pictures_are_left_out_and_said(smooth, tmp_path) -> None:
     assert any("pictures repeat the one before although the joints moved (frames " in note for note in result.notes)
 
 
+@pytest.mark.slow
 def test_arms_at_rest_may_show_the_same_picture_again(smooth, tmp_path) -> None:
     folder = shutil.copytree(smooth, tmp_path / "recording")
     edited_joints(folder, lambda header, rows: [[row[0], *rows[0][1:]] for row in rows])
