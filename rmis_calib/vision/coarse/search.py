@@ -95,8 +95,9 @@ def small_views(
         views, tone = appearance.smooth(1 - inside[:, 0])[:, None], torch.zeros_like(inside[:, 0])
     # Each view is searched as a frame of its own, until the best strips of each picture are chosen.
     count = views.shape[1]
-    unlike, around, tones = (views.flatten(0, 1), *(layer.repeat_interleave(count, 0) for layer in (seen, tone)))
-    layers = torch.stack([unlike, around.to(unlike.dtype), tones])
+    layers = views.new_empty(3, *views.shape)
+    layers[0], layers[1], layers[2] = views, seen.to(views.dtype)[:, None], tone[:, None]
+    layers = layers.flatten(1, 2)
     return SmallViews(rgb, seen, well_inside, views, strips.SmallPicture(layers, count, canvas, images.shape[-1]))
 
 
@@ -147,7 +148,7 @@ def trace_along(images: Tensor, canvas: Canvas, settings: DetectorSettings, expe
     each = {name: value.repeat_interleave(picture.views, 0) for name, value in vars(expected).items()}
     view = torch.arange(len(each["frame"]), device=expected.frame.device)
     several = strips.Strips(**each | {"frame": view[:, None]}).listed(torch.ones_like(each["valid"]))
-    straight, _ = trace.straighten(trace.trace(picture, several, settings))
+    straight, _ = trace.straighten(trace.walk(picture, several, settings))
     traced = trace.trace(picture, straight, settings)
     keep = each["valid"].reshape(-1, picture.views)
     scores = keep.to(traced.width.dtype)
@@ -158,7 +159,7 @@ def trace_along(images: Tensor, canvas: Canvas, settings: DetectorSettings, expe
 def _look_along(small: SmallViews, several: strips.Strips) -> StripVerdict:
     """What the network says of strips in any of the views; places of ends as stations, px."""
     number = several.frame // small.picture.views
-    seen = small.seen.to(small.rgb.dtype)
+    seen = small.picture.layers[1, :: small.picture.views]
     straight, chord = straighten_pictures(small.rgb, seen, small.picture.canvas, several, number)
     return load_network(small.rgb.device).judge(straight, chord.flatten(0, 1))
 
@@ -180,7 +181,7 @@ def _best(
     best = best.reshape(-1, picture.views * wanted)
     keep = best > 0
     keep[0, 0] |= ~keep.any()  # an empty list would have no medians
-    straight, wander = trace.straighten(trace.trace(picture, few.strips.listed(keep), settings))
+    straight, wander = trace.straighten(trace.walk(picture, few.strips.listed(keep), settings))
     merit = torch.zeros_like(best)
     merit[keep] = best[keep] / (1 + (wander / (0.02 * few.width[keep] + picture.factor)).square())[0]
     lit = few.strips.frame % picture.views > 0
@@ -208,8 +209,10 @@ def _lay_out(
     """The shrunken picture, its field of view and the inner part of that, in ideal pixels."""
     if canvas.covered is None:
         return small, field, within
-    stack = canvas.lay_out(torch.cat([small, field[:, None].to(small.dtype), within[:, None].to(small.dtype)], 1))
-    return stack[:, :3], (stack[:, 3] > 0.5) & canvas.covered, (stack[:, 4] > 0.99) & canvas.covered
+    # One layer for both: 2 within, 1 in the rest of the field, which is wider than a pixel, 0 beyond.
+    inwards = (field.view(torch.uint8) + within.view(torch.uint8))[:, None].to(small.dtype)
+    stack = canvas.lay_out(torch.cat([small, inwards], 1))
+    return stack[:, :3], (stack[:, 3] > 0.5) & canvas.covered, (stack[:, 3] > 1.99) & canvas.covered
 
 
 def _edges(

@@ -39,7 +39,7 @@ _TOLERANCE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Trace:
+class Course:
     """Strips turned to run towards the tip, and where their contours were seen."""
 
     strips: Strips
@@ -55,15 +55,21 @@ class Trace:
     """Lateral place of [left, right] contour, px, smooth along the shaft."""
     start: Float[Tensor, "b k"]
     """First station of the shaft, px."""
-    end: Float[Tensor, "b k"]
-    """Last station of the last stretch long enough to carry the shaft's end, px."""
     start_at_border: Bool[Tensor, "b k"]
     end_at_border: Bool[Tensor, "b k"]
     """Whether the shaft leaves the field of view at its start and at its end."""
-    closed: Bool[Tensor, "b k"]
-    """Between its start and the border something brighter shows: it does not come from there, or is covered."""
     width: Float[Tensor, "b k"]
     """Median width, px."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trace(Course):
+    """What else is told of a strip that may be a shaft."""
+
+    end: Float[Tensor, "b k"]
+    """Last station of the last stretch long enough to carry the shaft's end, px."""
+    closed: Bool[Tensor, "b k"]
+    """Between its start and the border something brighter shows: it does not come from there, or is covered."""
     length: Float[Tensor, "b k"]
     """Supported length, px."""
     contrast: Float[Tensor, "b k"]
@@ -96,8 +102,59 @@ class _Stretch:
         return replace(self, on=self.on | more, main=self.main | more)
 
 
+@dataclass(frozen=True, eq=False)
+class _Walk:
+    """Strips walked from the lowest station to the highest."""
+
+    profiles: StripProfiles
+    strips: Strips
+    stretch: _Stretch
+    borders: tuple[Bool[Tensor, "b k"], Bool[Tensor, "b k"]]
+    """Whether the shaft reaches the low, the high border."""
+    closed: Bool[Tensor, "b k 2"]
+    """Whether something brighter lies before that border."""
+    turn: Bool[Tensor, "b k"]
+    """Whether the shaft enters on the high side."""
+
+
 def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> Trace:
-    """Contours, the stretch that is a shaft, and which way the tip is."""
+    """Contours, the stretch that is a shaft, which way the tip is, and what tells shafts from what is none."""
+    walked = _walk(picture, strips, settings)
+    profiles, stretch, turn = walked.profiles, walked.stretch, walked.turn
+    low_end, high_end = _ends(profiles, strips, stretch, settings)
+    tint = masked_median(profiles.middle.tint, stretch.main)
+    return Trace(
+        **vars(_towards_tip(walked, settings.min_contrast)),
+        end=torch.where(turn, -low_end, high_end),
+        closed=torch.where(turn, walked.closed[..., 1], walked.closed[..., 0]),
+        length=stretch.on.float().sum(-1) * profiles.spacing,
+        contrast=masked_median(torch.where(torch.isfinite(profiles.step), profiles.step, 0.0), stretch.on),
+        tint=tint,
+        evenness=evenness(profiles, tint, stretch.main),
+        surround=stretch.surround,
+    )
+
+
+def walk(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> Course:
+    """The first part of `trace`."""
+    return _towards_tip(_walk(picture, strips, settings), settings.min_contrast)
+
+
+def straighten(course: Course) -> tuple[Strips, Float[Tensor, "b k"]]:
+    """The strips with straight lines through their traced contours, and how far these wander from them, px."""
+    t, main = course.t.expand_as(course.lateral), course.main[:, :, None].expand_as(course.lateral)
+    spacing = float(course.t[1] - course.t[0])
+    tolerance = (_TOLERANCE * course.width).clamp(min=0.3 * spacing)[..., None].expand_as(course.strips.offset)
+    line = fit_lines(t, course.lateral, course.sides.to(t.dtype), main, tolerance, 0.1 * spacing)
+    both = ((line.inliers > 5) & (line.slope.abs() < 0.2)).all(-1, keepdim=True)
+    before = course.strips
+    offset, slope = torch.where(both, line.offset, before.offset), torch.where(both, line.slope, before.slope)
+    wander = torch.where(both[..., 0], line.scatter_px.amax(-1), 0.05 * course.width)
+    return replace(before, offset=offset, slope=slope), wander
+
+
+def _walk(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> _Walk:
+    """Follow both contours; find what is shaft, where it enters, and where it goes on though nothing shows it."""
     profiles = read_profiles(picture, strips)
     t, seen = profiles.t, profiles.seen
     stretch = _contoured_stretch(profiles, strips, settings.min_width_fraction * picture.width_px, settings)
@@ -107,8 +164,10 @@ def trace(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
     to_border, borders = enter(t, stretch.contoured | hidden, stretch.main, seen, stretch.width)
     way = ways(t, stretch.on, seen)
     closed = (way & tone.brighter[:, :, None]).sum(-1) > 1
-    borders = through_the_dark(way, closed, stretch.on, borders)
-    return _towards_tip(profiles, strips, stretch.with_also(to_border), borders, closed, settings)
+    low, high = borders = through_the_dark(way, closed, stretch.on, borders)
+    stretch = stretch.with_also(to_border)
+    nearer_high = last_on(t, seen) - last_on(t, stretch.on) < first_on(t, stretch.on) - first_on(t, seen)
+    return _Walk(profiles, strips, stretch, borders, closed, (high & ~low) | ((high == low) & nearer_high))
 
 
 def _contoured_stretch(
@@ -172,66 +231,23 @@ def _ends(
     )
 
 
-def _towards_tip(
-    profiles: StripProfiles,
-    strips: Strips,
-    stretch: _Stretch,
-    borders: tuple[Bool[Tensor, "b k"], Bool[Tensor, "b k"]],
-    closed: Bool[Tensor, "b k 2"],
-    settings: DetectorSettings,
-) -> Trace:
-    """The stretch walked from the border inwards: turned round where the shaft enters on the high side.
-
-    Args:
-        profiles: of the strips.
-        strips: between straight lines.
-        stretch: what is shaft of them.
-        borders: whether it reaches the low, the high border.
-        closed: whether something brighter lies before it.
-        settings: limits of what carries the end.
-    """
-    t, seen, on, main, (low, high) = profiles.t, profiles.seen, stretch.on, stretch.main, borders
-    low_start, high_start = first_on(t, on), last_on(t, on)
-    low_end, high_end = _ends(profiles, strips, stretch, settings)
-    low_gap, high_gap = low_start - first_on(t, seen), last_on(t, seen) - high_start
-    flip = (high & ~low) | ((high == low) & (high_gap < low_gap))
-    sides = on[:, :, None] & profiles.sides.seen
-    line = strips.contour(t.expand_as(on))
-    lateral = line + smooth_over(profiles.sides.lateral - line, sides)
-    sides &= profiles.sides.rise > settings.min_contrast
-    turn, turn_both = flip[..., None], flip[..., None, None]
-    tint = masked_median(profiles.middle.tint, main)
-    return Trace(
-        strips=strips.reverse(flip),
+def _towards_tip(walked: _Walk, min_contrast: float) -> Course:
+    """The walk from the border inwards: turned round where the shaft enters on the high side."""
+    t, on, main, (low, high) = walked.profiles.t, walked.stretch.on, walked.stretch.main, walked.borders
+    sides = on[:, :, None] & walked.profiles.sides.seen
+    line = walked.strips.contour(t.expand_as(on))
+    lateral = line + smooth_over(walked.profiles.sides.lateral - line, sides)
+    sides &= walked.profiles.sides.rise > min_contrast
+    turn, stations, both = walked.turn, walked.turn[..., None], walked.turn[..., None, None]
+    return Course(
+        strips=walked.strips.reverse(turn),
         t=t,
-        main=torch.where(turn, main.flip(-1), main),
-        on=torch.where(turn, on.flip(-1), on),
-        sides=torch.where(turn_both, sides.flip(2).flip(3), sides),
-        lateral=torch.where(turn_both, -lateral.flip(2).flip(3), lateral),
-        start=torch.where(flip, -high_start, low_start),
-        end=torch.where(flip, -low_end, high_end),
-        start_at_border=torch.where(flip, high, low),
-        end_at_border=torch.where(flip, low, high),
-        closed=torch.where(flip, closed[..., 1], closed[..., 0]),
-        width=stretch.width,
-        length=on.float().sum(-1) * profiles.spacing,
-        contrast=masked_median(torch.where(torch.isfinite(profiles.step), profiles.step, 0.0), on),
-        tint=tint,
-        evenness=evenness(profiles, tint, main),
-        surround=stretch.surround,
-    )
-
-
-def straighten(traced: Trace) -> tuple[Strips, Float[Tensor, "b k"]]:
-    """The strips with straight lines through their traced contours, and how far these wander from them, px."""
-    t, main = traced.t.expand_as(traced.lateral), traced.main[:, :, None].expand_as(traced.lateral)
-    spacing = float(traced.t[1] - traced.t[0])
-    tolerance = (_TOLERANCE * traced.width).clamp(min=0.3 * spacing)[..., None].expand_as(traced.strips.offset)
-    line = fit_lines(t, traced.lateral, traced.sides.to(t.dtype), main, tolerance, 0.1 * spacing)
-    sane = (line.inliers > 5) & (line.slope.abs() < 0.2)
-    both = sane.all(-1, keepdim=True)
-    strips = traced.strips
-    offset, slope = torch.where(both, line.offset, strips.offset), torch.where(both, line.slope, strips.slope)
-    return replace(strips, offset=offset, slope=slope), torch.where(
-        both[..., 0], line.scatter_px.amax(-1), 0.05 * traced.width
+        main=torch.where(stations, main.flip(-1), main),
+        on=torch.where(stations, on.flip(-1), on),
+        sides=torch.where(both, sides.flip(2).flip(3), sides),
+        lateral=torch.where(both, -lateral.flip(2).flip(3), lateral),
+        start=torch.where(turn, -last_on(t, on), first_on(t, on)),
+        start_at_border=torch.where(turn, high, low),
+        end_at_border=torch.where(turn, low, high),
+        width=walked.stretch.width,
     )

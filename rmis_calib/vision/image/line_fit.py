@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from rmis_calib.vision.image.run_length import masked_mean
+
 _ITERATIONS = 5
 _BLOCKS = 12
 # Lines compared at first, and points that are asked about each.
@@ -54,25 +56,34 @@ def fit_lines(
         tolerance: standard deviation of a point that is not astray, px, by which lines are first compared.
         floor_px: smallest standard deviation of one point.
     """
-    offset, slope = _consensus(t, y, weight * trusted, tolerance)
-    near = (y - offset[..., None] - slope[..., None] * t).abs() < 3 * tolerance[..., None]
-    robust = weight * (trusted & near)
+    trusted = trusted & (weight > 0)
+    first = _consensus(t, y, weight * trusted, tolerance)
+    # About the middle of the trusted points and the first line, numbers are small: sums of squares lose nothing.
+    middle = masked_mean(t, trusted)
+    from_middle = t - middle[..., None]
+    start, incline = first[0] + first[1] * middle, first[1]
+    off = y - start[..., None] - incline[..., None] * from_middle
+    columns = torch.stack([torch.ones_like(t), from_middle, off, from_middle.square(), from_middle * off], -2)
+    near = trusted & (off.abs() < 3 * tolerance[..., None])
+    unknown = torch.where(near, 0.0, torch.nan)
+    robust = weight * near
     for _ in range(_ITERATIONS):
-        offset, slope, centre, spread = _solve(t, y, robust)
-        residual = y - offset[..., None] - slope[..., None] * t
-        size = torch.where((weight > 0) & trusted & near, residual.abs(), torch.nan)
-        scale = torch.nan_to_num(1.4826 * size.nanmedian(-1).values).clamp(min=floor_px)
-        robust = weight * (1 - (residual / (4.7 * scale[..., None])).square()).clamp(min=0.0).square()
-    wander = torch.where((weight > 0) & trusted, residual.abs(), torch.nan).nanmedian(-1).values
+        centre, mean, slope, variance = _solve(columns, robust)
+        residual = off - mean[..., None] - slope[..., None] * (from_middle - centre[..., None])
+        scale = (residual.abs() + unknown).nanmedian(-1).values.nan_to_num_().mul_(1.4826).clamp_(min=floor_px)
+        robust = weight * (1 - (residual / (4.7 * scale[..., None])).square()).clamp_(min=0.0).square_()
+    spread = variance.sqrt()
+    wander = torch.where(trusted, residual.abs(), torch.nan).nanmedian(-1).values
     inliers = robust.sum(-1).square() / robust.square().sum(-1).clamp(min=1e-9)
     scatter = ((robust * residual.square()).sum(-1) / robust.sum(-1).clamp(min=1e-9)).sqrt().clamp(min=floor_px)
     independent = scatter * (2.0 / inliers.clamp(min=3.0)).sqrt()
-    together = _block_sigma(residual, robust, (t - centre[..., None]) / spread[..., None].clamp(min=1e-6))
+    together = _block_sigma(residual, robust, (from_middle - centre[..., None]) / spread[..., None].clamp(min=1e-6))
     sigma = torch.maximum(independent, together)
+    slope = slope + incline
     return LineFit(
-        offset,
+        start + mean - slope * (middle + centre) + incline * centre,
         slope,
-        centre,
+        middle + centre,
         spread,
         scatter,
         (1.4826 * torch.nan_to_num(wander)).clamp(min=floor_px),
@@ -100,14 +111,15 @@ def _consensus(
     return offset.gather(-1, best)[..., 0], slope.gather(-1, best)[..., 0]
 
 
-def _solve(t: Tensor, y: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    total = weight.sum(-1).clamp(min=1e-9)
-    centre = (weight * t).sum(-1) / total
-    mean = (weight * y).sum(-1) / total
-    dt = t - centre[..., None]
-    variance = (weight * dt.square()).sum(-1) / total
-    slope = (weight * dt * y).sum(-1) / total / variance.clamp(min=1e-9)
-    return mean - slope * centre, slope, centre, variance.sqrt()
+def _solve(
+    columns: Float[Tensor, "*b 5 p"], weight: Float[Tensor, "*b p"]
+) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b"], Float[Tensor, "*b"], Float[Tensor, "*b"]]:
+    """Weighted means of t and y, slope, and variance of t, from the columns 1, t, y, t^2, t y."""
+    total, t, y, tt, ty = (columns * weight[..., None, :]).sum(-1).unbind(-1)
+    total = total.clamp(min=1e-9)
+    t, y = t / total, y / total
+    variance = (tt / total - t * t).clamp_(min=0.0)
+    return t, y, (ty / total - t * y) / variance.clamp(min=1e-9), variance
 
 
 def _block_sigma(
