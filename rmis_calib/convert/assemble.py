@@ -91,7 +91,7 @@ def _instrument(arms: dict[str, ArmLog], settings: ConvertSettings, job: Job) ->
 
 def _laparoscope(arms: dict[str, ArmLog], instrument: ArmLog, settings: ConvertSettings, job: Job) -> ArmLog | None:
     if settings.laparoscope in STILL:
-        job.note("laparoscope: told to stand still; the frame `arm` is the instrument's base")
+        job.note("laparoscope: the camera stands still; the frame `arm` is the instrument's base")
         return None
     if settings.laparoscope is not None:
         if settings.laparoscope not in arms:

@@ -76,7 +76,10 @@ def logs_of_table(
             continue
         missing = [joint_column(name, j) for j, v in zip(robot.arms[name].joints, values, strict=True) if v is None]
         if missing:
-            expected = f"columns {', '.join(missing)}, or --map COLUMN NAME:UNIT for each"
+            expected = (
+                f"columns {', '.join(missing)}, or --map COLUMN NAME:UNIT for each, or a --robot file of yours whose "
+                "arms have only the joints that are logged"
+            )
             raise RecordingError(where=str(table.path), expected=expected, found=", ".join(table.columns))
         log = ArmLog(name, joint_names=tuple(joint.name for joint in robot.arms[name].joints))
         log.joint_ns = [int(ns) for ns in row_ns]

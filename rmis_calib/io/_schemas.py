@@ -4,7 +4,7 @@ What the keys of robot.yaml mean is said in `rmis_calib.robot`.
 """
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
@@ -115,6 +115,14 @@ class CameraSchema(Schema):
     cy: float
     distortion_model: LensModel = "plumb_bob"
     distortion: list[float]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_distortion(cls, given: Any) -> Any:
+        if isinstance(given, dict) and "distortion" not in given and set(given) <= set(cls.model_fields):
+            expected = "distortion: [k1, k2, p1, p2, k3] (five zeros for undistorted images)"
+            raise ValueError(f"expected {expected}, found none")
+        return given
 
     @model_validator(mode="after")
     def _as_many_as_the_model_has(self) -> "CameraSchema":

@@ -134,7 +134,10 @@ def write_picture(path: Path, image_rgb: np.ndarray) -> None:
     """A JPEG from RGB.
 
     Raises:
-        OutputError: the file cannot be written.
+        OutputError: the file cannot be written; says why, which `cv2.imwrite` does not.
     """
-    if not cv2.imwrite(str(path), np.ascontiguousarray(image_rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 92]):
-        raise OutputError(where=str(path), expected="a place that can be written")
+    _, coded = cv2.imencode(".jpg", np.ascontiguousarray(image_rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 92])
+    try:
+        path.write_bytes(coded.tobytes())
+    except OSError as error:
+        raise OutputError(where=str(path), expected="a place that can be written", found=error.strerror) from error

@@ -183,6 +183,11 @@ CASES: dict[str, Case] = {
         r"stereo\.yaml: right\.fx: expected a focal",
     ),
     "negative focal": (edit("stereo.yaml", right__fy=-91.0), RecordingError, r"right\.fy: expected more than 0"),
+    "no distortion": (
+        edit("stereo.yaml", right__distortion=REMOVE),
+        RecordingError,
+        r"right: expected distortion: \[k1, k2, p1, p2, k3\] \(five zeros for undistorted images\), found none",
+    ),
     "principal point": (edit("stereo.yaml", left__cx=900.0), RecordingError, r"left\.cx: expected a principal point"),
     "four distortions": (
         edit("stereo.yaml", right__distortion=[0.0] * 4),

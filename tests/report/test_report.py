@@ -11,6 +11,7 @@ import pytest
 from rmis_calib.errors import InputError, OutputError, ShapeError
 from rmis_calib.geometry.rigid import RigidTransform
 from rmis_calib.report import Mark, Overlay, ReportMaterial, write_report
+from rmis_calib.report.detection_pictures import write_picture
 from rmis_calib.report.drawing.rejections import RejectionSheet
 from rmis_calib.results import CalibrationResult, EndCounts, Motions, ShaftEnds
 
@@ -261,6 +262,12 @@ def test_nothing_is_left_or_replaced_when_writing_fails(
     monkeypatch.undo()
     assert target.read_text(encoding="utf-8") == old
     assert list(tmp_path.iterdir()) == [target]
+
+
+def test_a_picture_that_cannot_be_written_says_why(tmp_path: Path) -> None:
+    picture = np.zeros((8, 8, 3), dtype=np.uint8)
+    with pytest.raises(OutputError, match=r"expected a place that can be written, found No such file"):
+        write_picture(tmp_path / "absent" / "overlay.jpg", picture)
 
 
 def test_absent_folder_is_an_output_error(result_with: MakeResult, tmp_path: Path) -> None:
