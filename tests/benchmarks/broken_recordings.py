@@ -132,11 +132,17 @@ def merged(settings: Yaml, changes: Yaml) -> Yaml:
 def write_broken(name: str, parent: Path, seed: int) -> Path:
     """The recording of this name, with its reference."""
     broken = BROKEN[name]
-    settings = merged(config_to_dict(load_synth_config("demo")), broken.rendered | {"seed": seed})
-    folder = write_recording(parent / name.replace(" ", "_"), SynthConfig(**settings))
+    folder = write_rendered(parent / name.replace(" ", "_"), broken.rendered, seed)
+    broken.change(folder)
+    return folder
+
+
+def write_rendered(folder: Path, settings: Yaml, seed: int) -> Path:
+    """A recording of the demo's settings with some changed, and its reference."""
+    settings = merged(config_to_dict(load_synth_config("demo")), settings | {"seed": seed})
+    write_recording(folder, SynthConfig(**settings))
     truth = yaml.safe_load((folder / "ground_truth.yaml").read_text())["camera_right_T_arm"]
     reference = {"camera_right_T_arm": truth, "sigma_deg": 0.0, "sigma_mm": 0.0}
     (folder / "reference.yaml").write_text(yaml.safe_dump(reference))
     edited(folder / "robot.yaml", without_sigmas)
-    broken.change(folder)
     return folder
