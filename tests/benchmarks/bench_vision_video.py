@@ -3,7 +3,7 @@
     python tests/benchmarks/bench_vision_video.py [--frames 1000 10000] [--preset mild] [--every 1 4]
         [--search-every 8 1]
 
-A rendered smooth stereo video is repeated packet by packet to the length asked for (so there is a cut every 60 pairs).
+A rendered smooth stereo video is repeated packet by packet to the length asked for (so there is a cut every 240 pairs).
 Each row is a process of its own; a frame is one picture, so a stereo pair counts twice. Decoding alone reads both
 videos side by side, each in its own thread, to RGB tensors, as detection does. `--search-every 1` searches every frame
 from the start, 8 every eighth or so (rmis_calib/pipeline/pictures/memory.py). Shares of decoding alone: of its pictures
@@ -30,7 +30,7 @@ from rmis_calib.config import CalibrationConfig
 from rmis_calib.io import load_recording
 from rmis_calib.pipeline import detect
 
-PAIRS = 60
+PAIRS = 240
 
 
 def repeat_video(path: Path, times: int) -> None:

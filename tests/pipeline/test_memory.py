@@ -200,10 +200,11 @@ def test_batches_and_threads_change_no_bit(video: tuple[torch.Tensor, SideTruth,
 
 @pytest.mark.parametrize("size", [1, 5, 32, 33, 100])
 def test_runs_hold_every_picture_once(size: int) -> None:
-    pictures = torch.arange(70, dtype=torch.uint8)[:, None, None, None].expand(-1, 3, 2, 2)
+    pictures = torch.arange(70, dtype=torch.uint8)[:, None, None, None].repeat(1, 2, 2, 3).permute(0, 3, 1, 2)
     batches = (FrameBatch(3 * torch.arange(70)[i : i + size], pictures[i : i + size]) for i in range(0, 70, size))
     runs = list(in_runs(batches))
     assert [len(run.indices) for run in runs] == [RUN, RUN, 6]
+    assert all(run.images.is_contiguous(memory_format=torch.channels_last) for run in runs)  # else all is slow
     assert torch.cat([run.indices for run in runs]).tolist() == list(range(0, 210, 3))
     assert torch.equal(torch.cat([run.images for run in runs]), pictures)
 

@@ -37,20 +37,26 @@ _SURE, _LESS_SURE = 0.95, 0.05
 
 def in_runs(batches: Iterator[FrameBatch]) -> Iterator[FrameBatch]:
     """The same pictures, `RUN` at a time; the last ones fewer."""
-    indices: list[Tensor] = []
-    images: list[Tensor] = []
+    parts: list[FrameBatch] = []
     waiting = 0
     for batch in batches:
-        for first in range(0, len(batch.indices), RUN):
-            indices.append(batch.indices[first : first + RUN])
-            images.append(batch.images[first : first + RUN])
-            waiting += len(indices[-1])
-            if waiting >= RUN:
-                run = FrameBatch(torch.cat(indices), torch.cat(images))
-                yield FrameBatch(run.indices[:RUN], run.images[:RUN])
-                indices, images, waiting = [run.indices[RUN:]], [run.images[RUN:]], waiting - RUN
+        first = 0
+        while first < len(batch.indices):
+            part = slice(first, first + RUN - waiting)
+            parts.append(FrameBatch(batch.indices[part], batch.images[part]))
+            waiting += len(parts[-1].indices)
+            first += len(parts[-1].indices)
+            if waiting == RUN:
+                yield _joined(parts)
+                parts, waiting = [], 0
     if waiting:
-        yield FrameBatch(torch.cat(indices), torch.cat(images))
+        yield _joined(parts)
+
+
+def _joined(parts: list[FrameBatch]) -> FrameBatch:
+    if len(parts) == 1:
+        return parts[0]
+    return FrameBatch(torch.cat([part.indices for part in parts]), torch.cat([part.images for part in parts]))
 
 
 def detect_run(detector: ShaftDetector, images: Tensor, search_every: int, at_once: int) -> ShaftDetections:
@@ -87,7 +93,12 @@ def _between(
     """Places of the pictures that show what their neighbours agree on, and what is in these."""
     place = torch.cat([stretch.between for stretch in stretches])
     expected = torch.cat([stretch.expected() for stretch in stretches])
-    looked = detector.look_near(pick_pictures(images, place), expected)
+    if 2 * len(place) < len(images):
+        looked = detector.look_near(pick_pictures(images, place), expected)
+    else:  # to copy most of them takes longer than to prepare a few more
+        everywhere = expected.new_full((len(images), *expected.shape[1:]), torch.nan)
+        everywhere[place] = expected
+        looked = detector.look_near(images, everywhere).of_frames(place)
     sizes = [len(stretch.between) for stretch in stretches]
     parts = zip(stretches, torch.arange(len(place)).split(sizes), expected.split(sizes), strict=True)
     good = torch.cat([stretch.confirmed(looked.of_frames(rows), lines) for stretch, rows, lines in parts])
