@@ -83,12 +83,20 @@ def test_only_an_end_of_a_known_kind_counts(scene):
     assert not again.end_valid[1::2].any()
 
 
-@pytest.mark.parametrize("turn_deg", [5.0, -5.0])
-@pytest.mark.parametrize("shift_mm", [(10.0, 0.0, 0.0), (-10.0, 0.0, 0.0), (0.0, 10.0, 0.0), (0.0, -10.0, 0.0)])
-def test_a_wrong_answer_gathers_no_support(scene, shift_mm, turn_deg):
+def test_a_wrong_answer_gathers_no_more_support_than_chance(scene):
+    """10 mm and 5 deg off along and about each axis, against contours that are turned and shifted at random."""
     images, truth, camera = scene
-    found = ShaftDetector(camera=camera).look_along(images, expected(truth, shift_mm, turn_deg))
-    assert found.valid.sum() <= 1
+    detector, rng = ShaftDetector(camera=camera), np.random.default_rng(0)
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    wrong = [(10.0 * axis, turn, axes[(i + 2) % 3]) for i, axis in enumerate(axes) for turn in (5.0, -5.0)]
+    chance = [(np.append(rng.uniform(-40.0, 40.0, 2), 0.0), rng.uniform(20.0, 340.0), (0.0, 0.0, 1.0)) for _ in wrong]
+
+    def support(answers):
+        looks = [detector.look_along(images, expected(truth, *answer)) for answer in answers]
+        return sum(int(look.valid.sum()) for look in looks)
+
+    # Measured: 1 of 72 looks of the wrong ones, none by chance; a good answer finds at least 5 of 6 (above).
+    assert support(wrong) <= support(chance) + 2
 
 
 def test_what_is_no_picture_or_does_not_fit_shows_nothing(scene):
