@@ -11,6 +11,7 @@ from rmis_calib.vision.coarse.strips import Strips
 from rmis_calib.vision.coarse.trace import Trace
 from rmis_calib.vision.detections import EndKind
 from rmis_calib.vision.fine.subpixel import step_estimator
+from rmis_calib.vision.image.run_length import third_lowest
 from rmis_calib.vision.image.sampling import FullPicture
 
 _ROWS = 11
@@ -112,7 +113,7 @@ def locate(
 
 def _darker_rows(values: Float[Tensor, "b k r ..."]) -> Float[Tensor, "b k ..."]:
     """The third lowest over the rows: a glare stripe may be as bright as the wrist, but leaves some rows dark."""
-    return values.kthvalue(3, dim=2).values
+    return third_lowest(values)
 
 
 def _separate(colours: Float[Tensor, "b k r n 3"], seen: Bool[Tensor, "b k n"]) -> Float[Tensor, "b k r n"]:

@@ -117,14 +117,15 @@ class FullPicture:
         single values.
         """
         height, width = self.images.shape[-2:]
+        shape = u.shape
         # A strip that no contour supports may have no place: it reads the corner and is not inside.
-        u, v = torch.nan_to_num(u).clamp(0, width - 1.001), torch.nan_to_num(v).clamp(0, height - 1.001)
-        column, row = u.to(torch.int64), v.to(torch.int64)
-        frame = self.frame.reshape(*self.frame.shape, *[1] * (u.ndim - 2))
-        at = ((frame * height + row) * width + column).reshape(-1)
+        u, v = (torch.nan_to_num(at).clamp_(0, length - 1.001).reshape(-1) for at, length in ((u, width), (v, height)))
+        column, row = u.floor(), v.floor()
+        first_row = (self.frame * height).reshape(-1).repeat_interleave(u.numel() // self.frame.numel())
+        at = row.to(torch.int64).add_(first_row).mul_(width).add_(column.to(torch.int64))
         pixels = self.images.permute(0, 2, 3, 1).reshape(-1)
         pairs = pixels.as_strided((pixels.numel() // 3 - 1, 6), (3, 1))
-        du, dv = (u - column).reshape(-1), (v - row).reshape(-1)
+        du, dv = u.sub_(column), v.sub_(row)
         rows = []
         for shift in (0, width):
             pair = pairs.index_select(0, at + shift).T.to(torch.float32, memory_format=torch.contiguous_format)
@@ -132,4 +133,4 @@ class FullPicture:
         colours = torch.lerp(rows[0], rows[1], dv)
         if self.images.dtype == torch.uint8:
             colours *= 1.0 / 255.0
-        return colours.reshape(3, *u.shape)
+        return colours.reshape(3, *shape)
