@@ -21,7 +21,7 @@ def load(name):
 @pytest.mark.slow
 def test_a_network_learns_edges_through_the_calibration():
     example = load("train_lines_through_calibration")
-    network = example.train(steps=15)
+    network = example.train(steps=8)  # measured: 0.43 of the steepest edge's error
     assert example.held_out_mm(network, 12) < 0.8 * example.held_out_mm(example.steepest, 12)
 
 
