@@ -1,7 +1,7 @@
 """Several calibrations of one set-up against each other: pooled, tested for agreement, searched for a change.
 
 A result is a normal distribution of x = [rotation vector, translation] in the tangent space at a common transform:
-R_i = exp(x_i) R_0, t_i = t_0 + x_i. Information adds (DESIGN.md, section 2, sufficient statistics): what the recordings
+R_i = exp(x_i) R_0, t_i = t_0 + x_i. Information adds: what the recordings
 share beside the transform (stereo extrinsics, shaft radius, end of the shaft, bias of the edges) is one unknown for all
 of them, with one prior, so that its error does not average out. What a covariance allows beyond that (encoders that may
 be off) is shared too, and is not averaged either.

@@ -102,7 +102,7 @@ def contour_planes(
         camera_p_axis: any point of the axis, mm.
         camera_v_axis: unit direction of the axis.
         radius_mm: radius of the cylinder.
-    Source: DESIGN.md, section 4.
+    Source: derived in rmis_calib/solver/model/residuals.py.
     """
     p, v = torch.broadcast_tensors(camera_p_axis, camera_v_axis)
     moment = torch.linalg.cross(p, v)

@@ -48,7 +48,7 @@ def contour(
     xy: Float[Tensor, "*#batch 2"],
     side: float,
 ) -> Float[Tensor, "..."]:
-    """Signed distance of an image point from the predicted contour of the shaft, normalised units (DESIGN.md, 4).
+    """Signed distance of an image point from the predicted contour of the shaft, normalised units.
 
     The contour is the line in which `contour_planes` meets the picture.
 
@@ -70,7 +70,7 @@ def end(
     s_end_mm: Float[Tensor, "*#batch"] | float,
     xy: Float[Tensor, "*#batch 2"],
 ) -> Float[Tensor, "..."]:
-    """Distance along the imaged axis of a measured shaft end from the predicted one, normalised units (DESIGN.md, 4).
+    """Distance along the imaged axis of a measured shaft end from the predicted one, normalised units.
 
     chi = X_d / X_u is the tangent of the angle, in the plane of the axis, between the point of the axis nearest to the
     camera and the measured ray; (s0 + s_end) / |M| is its prediction. Their difference is divided by its change for a

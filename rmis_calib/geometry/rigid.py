@@ -56,7 +56,6 @@ def rigid_exp(xi: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
 
     Args:
         xi: rotation vector in rad, then translation in mm.
-    Source: DESIGN.md, section 3, "(exp(c deg eps), c mm eps)".
     """
     return rigid_from_rotation_translation(rotvec_to_matrix(xi[..., :3]), xi[..., 3:])
 

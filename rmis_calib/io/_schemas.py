@@ -1,4 +1,4 @@
-"""What may stand in recording.yaml, stereo.yaml and robot.yaml (DESIGN.md 6.1): every key, its type and its range.
+"""What may stand in recording.yaml, stereo.yaml and robot.yaml (docs/recording.md): every key, its type and its range.
 
 What the keys of robot.yaml mean is said in `rmis_calib.robot`.
 """

@@ -1,4 +1,4 @@
-"""Shaft observations: the solver's own input, as arrays in memory and as an .npz file (DESIGN.md 6.2)."""
+"""Shaft observations: the solver's own input, as arrays in memory and as an .npz file (docs/observations.md)."""
 
 import math
 import zipfile

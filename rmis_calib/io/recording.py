@@ -1,4 +1,4 @@
-"""A recording folder: stereo video, joint log, cameras and robot, read strictly (DESIGN.md 6.1)."""
+"""A recording folder: stereo video, joint log, cameras and robot, read strictly (docs/recording.md)."""
 
 from dataclasses import dataclass
 from pathlib import Path

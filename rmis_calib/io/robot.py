@@ -1,4 +1,4 @@
-"""Robots from robot.yaml or a shipped preset (DESIGN.md 6.1)."""
+"""Robots from robot.yaml or a shipped preset (docs/recording.md)."""
 
 import math
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The camera or the stereo rig of a recording: stereo.yaml (DESIGN.md 6.1), or a calibration of another program.
+"""The camera or the stereo rig of a recording: stereo.yaml (docs/recording.md), or a calibration of another program.
 
 What a file is shows in its content, never in its name. Plain numbers: no torch is needed.
 """

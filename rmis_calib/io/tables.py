@@ -1,4 +1,4 @@
-"""frame_times.csv and head_points.csv (DESIGN.md 6.1)."""
+"""frame_times.csv and head_points.csv (docs/recording.md)."""
 
 from dataclasses import dataclass
 from pathlib import Path

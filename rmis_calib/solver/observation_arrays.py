@@ -1,4 +1,4 @@
-"""Arrays in the keys of an observations file (DESIGN.md 6.2), read as tensors of known shapes for `Problem`."""
+"""Arrays in the keys of an observations file (docs/observations.md), read as tensors of known shapes for `Problem`."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -4,8 +4,7 @@
 
 - `marginal`: the latent poses eliminated to first order at the measured ones (`joint` without its correction).
 - `Gauss-Helmert`: every motion's pose estimated too, and the rows linearised there (Foerstner & Wrobel 2016, 4.8).
-- `+ bootstrap`: Gauss-Helmert less its mean error on simulated data, solved in pairs of opposite noise
-  (DESIGN.md, section 3).
+- `+ bootstrap`: Gauss-Helmert less its mean error on simulated data, solved in pairs of opposite noise.
 - `joint`: the expected score of simulated data is subtracted (bias.py), without solving any of it.
 
 Axis lines, two cameras. `bias` is the length of the mean translation error over its own uncertainty, sigma of one

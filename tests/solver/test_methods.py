@@ -86,7 +86,7 @@ def test_same_seed_same_result(simulate, realistic):
 
 @pytest.mark.slow
 def test_bias_correction_removes_the_errors_in_variables_bias(simulate):
-    """At c = 1 the plain estimate is off by the same 0.5 mm in every trial (DESIGN.md, section 3)."""
+    """At c = 1 the plain estimate is off by the same 0.5 mm in every trial."""
     problem, truth, _ = simulate(
         trials=24, positions_laparoscope=3, pixel_noise_px=0.5, kinematics_noise_mm=1.0, kinematics_noise_deg=1.0
     )

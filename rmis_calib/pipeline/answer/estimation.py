@@ -57,8 +57,8 @@ def solve(
     """Estimate `camera_right_T_arm` from observations.
 
     Args:
-        observations: N motions in the keys of DESIGN.md 6.2; with `differentiable` also a mapping of these keys to
-            tensors, with any leading batch of trials.
+        observations: N motions in the keys of docs/observations.md; with `differentiable` also a mapping of these
+            keys to tensors, with any leading batch of trials.
         config: method, measurements to use, noise, thresholds; the defaults when None.
         throw: raise when the result is not trustworthy; otherwise its `status` and `message` say so.
         measurements: of your own, which `joint` uses beside the observations'.

@@ -20,7 +20,7 @@ from rmis_calib.robot import split_joint_column
 _FEW_KNOWN = 0.5
 """Share of frames with known joints below which the clocks, or the log, are in doubt."""
 _LEAST_TURN_DEG, _LEAST_SHIFT_MM = 2.0, 5.0
-"""Motion of the shaft below which nothing but noise is measured: DESIGN.md, section 3, has 10 deg and 20 mm."""
+"""Motion of the shaft below which nothing but noise is measured; the simulations have 10 deg and 20 mm."""
 _SAME_RAD, _SAME_MM = 0.01, 2.0
 """Motions nearer to each other are one: half a degree, and what noise of kinematics is."""
 _RARELY_FOUND = 0.25

@@ -115,8 +115,8 @@ def reasons_for(view: View, poses: MotionPoses, choice: Choice) -> np.ndarray:
 
 
 def _measured(side: str, detections: ShaftDetections, choice: Choice, model_sigma: float) -> dict[str, np.ndarray]:
-    """The chosen candidates as arrays of DESIGN.md 6.2; `model_sigma`, in normalised units, is added to every sigma in
-    quadrature."""
+    """The chosen candidates as arrays of docs/observations.md; `model_sigma`, in normalised units, is added to
+    every sigma in quadrature."""
     rows = torch.arange(len(choice.candidate), device=choice.candidate.device)
     best = choice.candidate.clamp_min(0)
     turned = choice.reversed

@@ -47,8 +47,7 @@ def two_step_solution(
     status = torch.where((excess > MAX_CHI2_PER_DOF) & (status == SolveStatus.CONVERGED), SolveStatus.MISFIT, status)
     observability = observability_of(axis_only, R, t, covariance, noise, (False, False, False), settings)
     static = (observability.degeneracy & Degeneracy.STATIC_LAPAROSCOPE) > 0
-    # A two-step estimate from a laparoscope that stands still is biased by more than its scatter shows (DESIGN.md,
-    # section 3).
+    # A two-step estimate from a laparoscope that stands still is biased by more than its scatter shows.
     observability = replace(
         observability,
         verdict=torch.where(static, observability.verdict.clamp_min(Verdict.WEAK.code), observability.verdict),

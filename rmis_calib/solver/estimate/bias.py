@@ -3,14 +3,13 @@
 Noise of the kinematics enters the Jacobian, the weights and the residuals of the score g = J^T S^-1 r together, and
 noise of the pose that a camera sees enters through the curvature of the projection. So E[g] at the true parameters is
 not zero but of second order in the noise, the same in every motion, while the standard error falls with N: for many
-motions the estimate is biased by more than its sigma (DESIGN.md, section 3). The estimate that solves g = E[g] is free
-of it to that order.
+motions the estimate is biased by more than its sigma. The estimate that solves g = E[g] is free of it to that order.
 
 E[g] comes from simulating the measurement at the estimate, with the measured kinematics taken as true, and evaluating
 the score there: no simulated problem is solved. Each draw is used with both signs. Terms of first (and any odd) order
 in the noise cancel exactly in the mean of the pair, so what remains to average is the second-order term itself: one
-pair knows the bias to a few per cent of the standard error, where a plain bootstrap (DESIGN.md) with B replicas adds
-1/B of the variance and needs B solves. `tests/benchmarks/bench_solver_efficiency.py` compares.
+pair knows the bias to a few per cent of the standard error, where a plain bootstrap with B replicas adds 1/B of the
+variance and needs B solves. `tests/benchmarks/bench_solver_efficiency.py` compares.
 
 The same pairs correct the information: noise in J inflates J^T S^-1 J by its own variance, and 2 H - E[H] removes
 that to second order.

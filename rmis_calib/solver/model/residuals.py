@@ -1,7 +1,7 @@
 """Residuals of lines, contours, ends and head points, with their analytic Jacobians.
 
-**Geometry** (DESIGN.md, section 4). In a camera's frame let p be the RCM, d the shaft's direction (RCM to tip), M = p x
-d, D = |M| the distance of the axis from the optical centre, m = M/D, u = d x m the unit vector from the optical centre
+**Geometry**. In a camera's frame let p be the RCM, d the shaft's direction (RCM to tip), M = p x d,
+D = |M| the distance of the axis from the optical centre, m = M/D, u = d x m the unit vector from the optical centre
 to the axis' nearest point c = D u, and s0 = p.d, so that p = D u + s0 d. A plane through the optical centre that
 touches a cylinder of radius r about the axis has the unit normal n with n.d = 0 and n.p = rho r, rho = +1 or -1 for the
 two contours: n = cos(alpha) m + rho sin(alpha) u, sin(alpha) = r/D. The axis itself is rho = 0, n = m.
