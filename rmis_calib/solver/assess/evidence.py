@@ -38,6 +38,8 @@ TIMING = ("clock_rate", "readout")
 """One number each, of a clock and of a camera. What an arm gives way has 70 coefficients, which take up what such a
 number leaves in the residuals: asked together, rows that are read one after the other look like an arm that gives
 way."""
+HINT = 0.1
+"""Chance of one of timing from which it is freed before an arm that gives way."""
 SEEN = 2.0
 """Information on a direction, in that of the prior, from which it counts."""
 
@@ -94,13 +96,17 @@ def weigh(fit: MapEstimate, settings: SolverSettings) -> Evidence:
 def freed_next(chance: dict[str, Float[Tensor, " b"]]) -> Int[Tensor, " b"]:
     """Which unknown the data of each trial ask for, by its place in `chance`; -1: none.
 
-    That of least chance beside its CHANCE, of those of timing if there is one.
+    That of least chance beside its CHANCE, of those of timing if there is one; before an arm that gives way, one of
+    timing that there is a HINT of.
     """
-    over = torch.stack([value / CHANCE[name] for name, value in chance.items()])
-    timing = torch.tensor([name in TIMING for name in chance], device=over.device)[:, None]
+    value = torch.stack([*chance.values()])
+    over = value / value.new_tensor([CHANCE[name] for name in chance])[:, None]
     asked = over < 1.0
-    passed_over = ~timing & (asked & timing).any(0)
-    return torch.where(asked.any(0), torch.where(passed_over, torch.inf, over).argmin(0), -1)
+    timing = torch.tensor([name in TIMING for name in chance], device=value.device)[:, None]
+    gives_way = asked[list(chance).index("compliance")] if "compliance" in chance else asked[0] & False
+    first = timing & (asked | ((value < HINT) & gives_way))
+    eligible = torch.where(first.any(0), first, asked)
+    return torch.where(asked.any(0), torch.where(eligible, over, torch.inf).argmin(0), -1)
 
 
 def _may_be_read_later(fit: MapEstimate) -> bool:
