@@ -1,6 +1,7 @@
-"""Time from a decoded uint8 picture to contour lines at 1280x720, beside OpenCV's full-frame chain in the same run.
+"""Time from a decoded uint8 picture to contour lines, beside OpenCV's full-frame chain in the same run.
 
-    python tests/benchmarks/bench_vision_speed.py [--device cpu] [--batches 1 4 8 16] [--repeats 12]
+    python tests/benchmarks/bench_vision_speed.py [--preset davinci_720] [--device cpu] [--batches 1 4 8 16]
+        [--repeats 12]
 
 The chain: colour conversion, 5x5 opening, Canny, probabilistic Hough transform, all at full size; it ends at segments.
 `alone` is one call after the other; `side by side` is a batch on each core, as the pipeline detects. All are the least
@@ -56,13 +57,14 @@ def timed(action: Callable[[], object], device: torch.device) -> tuple[float, fl
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--preset", default="davinci_720", help="of the pictures, which says their size: 1280x720")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--batches", type=int, nargs="+", default=[1, 4, 8, 16])
     parser.add_argument("--repeats", type=int, default=12)
     options = parser.parse_args()
     device, threads = torch.device(options.device), torch.get_num_threads()
     with tempfile.TemporaryDirectory() as folder:
-        config = dataclasses.replace(load_synth_config("davinci_720"), motions=max(options.batches))
+        config = dataclasses.replace(load_synth_config(options.preset), motions=max(options.batches))
         recording = load_recording(write_recording(Path(folder) / "r", config))
         images = next(recording.right.batches(max(options.batches), device)).images
     picture = np.ascontiguousarray(images[0].permute(1, 2, 0).cpu().numpy())
