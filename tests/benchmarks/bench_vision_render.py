@@ -44,7 +44,7 @@ PRESETS = (
     "clean", "mild", "tissue", "smoke", "barrel", "davinci_720", "davinci_986", "davinci_sd", "two_instruments",
     "glare", "carbon", "blood", "cholec", "leaving", "hard", "brutal", "absent",
 )  # fmt: skip
-FOUND_PX, BATCH = 3.0, 8
+FOUND_PX, BENCH_PX, BATCH = 3.0, 4.0, 8
 GOALS = {"clean": (0.05, 1.0), "brutal": (0.5, 0.9)}
 MIDDLE_GOAL = (0.15, 0.98)
 """Median contour error, px, and share of shafts found."""
@@ -320,7 +320,7 @@ def print_benches(count: int) -> None:
         seen = detector.detect(images[i : i + 1])
         ranks, used = set(seen.valid[0].nonzero()[:, 0].tolist()), set()
         for shaft in (s for s in shafts if s.visible):
-            on = {k for k in ranks if distances_px(seen, k, shaft.contour_uv).max() < 4.0}
+            on = {k for k in ranks if distances_px(seen, k, shaft.contour_uv).max() < BENCH_PX}
             visible, found, used = visible + 1, found + bool(on), used | on
         false += len(ranks - used)
         sure += sum(float(seen.confidence[0, k]) > SURE for k in ranks - used)

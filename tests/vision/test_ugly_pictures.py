@@ -62,11 +62,12 @@ def test_second_look_is_for_pictures_without_a_sure_shaft_only(monkeypatch: pyte
         assert looks == expected
 
 
+def chance(marks: list[float]) -> float:
+    return float(probability(tuple(torch.tensor([marks]).T[:, None]))[0, 0])
+
+
 def test_confidence_falls_as_contours_wander_and_shrink_and_the_inside_is_coloured() -> None:
-    good = torch.tensor([[-5.0, 1.0, 0.9, -0.1, -1.0, 0.02]])
-    sure = float(probability(tuple(good.T[:, None]))[0, 0])
-    assert sure > 0.9
-    for mark, worse in enumerate((-3.0, 0.0, 0.3, -1.5, -3.0, 1.0)):
-        bad = good.clone()
-        bad[0, mark] = worse
-        assert float(probability(tuple(bad.T[:, None]))[0, 0]) < sure
+    good = [-5.0, 1.0, 0.9, -0.1, -1.0, 0.02, 1.0, 0.0, 0.0]
+    assert chance(good) > 0.9
+    for mark, worse in enumerate((-3.0, 0.0, 0.3, -1.5, -3.0, 1.0, 0.0, 1.0, 1.0)):
+        assert chance([*good[:mark], worse, *good[mark + 1 :]]) < chance(good)

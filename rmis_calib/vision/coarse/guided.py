@@ -40,4 +40,5 @@ def trace_near(
     seen = small.seen.to(small.rgb.dtype)
     pictures, chord = straighten_pictures(small.rgb, seen, canvas, straight, straight.frame)
     verdict = load_network(images.device).judge(pictures, chord.flatten(0, 1))
-    return StripCandidates(traced, straight.frame, keep, keep.to(traced.width.dtype), verdict)
+    lit = small.picture.lit(straight)
+    return StripCandidates(traced, straight.frame, lit, keep, keep.to(traced.width.dtype), verdict)

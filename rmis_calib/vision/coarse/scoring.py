@@ -21,6 +21,7 @@ from rmis_calib.vision.image.run_length import (
 from rmis_calib.vision.settings import DetectorSettings
 
 _STATIONS, _GLANCES = 96, 32
+_ALIKE = 12
 _INNER, _RIM = 7, 4
 MAX_BRIGHTER = 0.5
 """Log brightness by which the inside of a shaft may exceed its surroundings. Slate-grey shafts on dark liver reach 0.3;
@@ -63,6 +64,10 @@ class Evidence:
     alternation: Float[Tensor, "b k"]
     """How much of the way between its first and its last stretch changes tones with what lies beside it, 0 to 1: the
     squares of a chessboard do, and one thing does not."""
+
+    def lies_on(self) -> Bool[Tensor, "b k k"]:
+        """Whether the middle of each shaft (first) lies on another (second) that runs the same way."""
+        return lies_on(self.strips, 0.5 * (self.start + self.end), self.width)
 
     def pick(self, index: Tensor) -> "Evidence":
         """The strips with these indices, (b, k') int64."""
@@ -146,7 +151,9 @@ def _glare(tint: Float[Tensor, "b k n s"], tone: Float[Tensor, "b k n s"]) -> Bo
 def screen(picture: SmallPicture, strips: Strips, settings: DetectorSettings, count: int) -> Strips:
     """The `count` strips that most look like one at a glance: five points across at 32 stations.
 
-    Votes alone favour long edges of tissue over the short contours of a shaft that just enters the picture.
+    Votes alone favour long edges of tissue over the short contours of a shaft that just enters the picture. Of strips
+    that lie on one another `_ALIKE` go before the others: one plain shaft gives dozens, and would leave no room for a
+    second one.
     """
     t = torch.linspace(-1, 1, _GLANCES, device=strips.offset.device) * picture.half_diagonal_px
     stations = t.expand(*strips.valid.shape, _GLANCES)
@@ -161,9 +168,14 @@ def screen(picture: SmallPicture, strips: Strips, settings: DetectorSettings, co
     right_rise = torch.where(seen[:, :, 4], value[:, :, 4] - inner, torch.inf)
     rise = torch.minimum(left_rise, right_rise)
     good = seen[:, :, 2] & torch.isfinite(rise) & (width > 0)
-    look = torch.where(good & (rise > 0.8 * settings.min_contrast), 1.0 + 0.5 * rise.clamp(0.0, 1.0), 0.0).sum(-1)
-    best = torch.where(strips.valid, look, -1.0).topk(min(count, look.shape[1]), dim=1)
-    return strips.pick(best.indices)
+    shaft_like = good & (rise > 0.8 * settings.min_contrast)
+    look = torch.where(shaft_like, 1.0 + 0.5 * rise.clamp(0.0, 1.0), 0.0).sum(-1)
+    look = torch.where(strips.valid, look, -1.0)
+    on = lies_on(strips, masked_mean(stations, shaft_like), masked_mean(width, shaft_like))
+    rank = look.argsort(dim=1, descending=True, stable=True).argsort(dim=1)
+    better = (on | on.mT) & (rank[:, :, None] > rank[:, None])
+    look = torch.where(better.sum(-1) < _ALIKE, look, look - 2.0 * _GLANCES)
+    return strips.pick(look.topk(min(count, look.shape[1]), dim=1).indices)
 
 
 def inspect(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> Evidence:
@@ -235,16 +247,20 @@ def score(evidence: Evidence, settings: DetectorSettings) -> Float[Tensor, "b k"
     return evidence.length * quality * evidence.purity**2 * entering * wanted
 
 
-def lies_on(evidence: Evidence) -> Bool[Tensor, "b k k"]:
-    """Whether the middle of each strip (first) lies on another (second) that runs the same way."""
-    strips = evidence.strips
-    middle = 0.5 * (evidence.start + evidence.end)
+def lies_on(strips: Strips, middle: Float[Tensor, "b k"], width: Float[Tensor, "b k"]) -> Bool[Tensor, "b k k"]:
+    """Whether the middle of each strip (first) lies on another (second) that runs the same way.
+
+    Args:
+        strips: of each picture.
+        middle: station of what may be a shaft, px.
+        width: of that, px.
+    """
     at = strips.points(middle[..., None], strips.contour(middle[..., None]).mean(2))[:, :, 0]  # (b, k, 2)
     relative = at[:, :, None] - strips.origin[:, None]
     station = (relative * strips.along[:, None]).sum(-1)  # (b, first, second)
     lateral = (relative * strips.left[:, None]).sum(-1)
     contour = strips.contour(station.mT).movedim(-1, 1)  # (b, first, second, 2)
-    margin = 0.25 * evidence.width[:, None]
+    margin = 0.25 * width[:, None]
     covered = (lateral < contour[..., 0] + margin) & (lateral > contour[..., 1] - margin)
     parallel = torch.einsum("bki,bji->bkj", strips.along, strips.along).abs() > 0.95
     return covered & parallel
@@ -252,7 +268,7 @@ def lies_on(evidence: Evidence) -> Bool[Tensor, "b k k"]:
 
 def distinct(evidence: Evidence, scores: Float[Tensor, "b k"], count: int) -> tuple[Tensor, Float[Tensor, "b c"]]:
     """Indices and scores of the best `count` strips that do not lie on one another."""
-    on = lies_on(evidence)
+    on = evidence.lies_on()
     overlap = on | on.mT
     left = scores.clone()
     chosen, values = [], []

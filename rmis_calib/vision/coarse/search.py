@@ -61,6 +61,8 @@ class StripCandidates:
     """The kept ones as one list, (1, m)."""
     frame: Int64[Tensor, "1 m"]
     """Picture that each of the list lies in."""
+    lit: Bool[Tensor, "1 m"]
+    """Which were found in the lit view."""
     keep: Bool[Tensor, "b c"]
     """Which ranks of which frames are in the list; at least one."""
     scores: Float[Tensor, "b c"]
@@ -152,8 +154,9 @@ def trace_along(images: Tensor, canvas: Canvas, settings: DetectorSettings, expe
     traced = trace.trace(picture, straight, settings)
     keep = each["valid"].reshape(-1, picture.views)
     scores = keep.to(traced.width.dtype)
-    everywhere = torch.ones_like(keep)
-    return StripCandidates(traced, view[None] // picture.views, everywhere, scores, _look_along(small, traced.strips))
+    everywhere, verdict = torch.ones_like(keep), _look_along(small, traced.strips)
+    number, lit = view[None] // picture.views, picture.lit(traced.strips)
+    return StripCandidates(traced, number, lit, everywhere, scores, verdict)
 
 
 def _look_along(small: SmallViews, several: strips.Strips) -> StripVerdict:
@@ -188,7 +191,7 @@ def _best(
     merit = torch.where(lit, _LIT_MERIT * merit, merit)
     # Between a contour and a stripe of glare lies a dark strip too, as straight as the shaft that holds it; and a shaft
     # with its shadow is another, a little wider.
-    over = scoring.lies_on(few) & lit[:, None] & ~lit[:, :, None] & (merit > 0)[:, None]  # dark (first) on lit (second)
+    over = few.lies_on() & lit[:, None] & ~lit[:, :, None] & (merit > 0)[:, None]  # dark (first) on lit (second)
     share = few.width[:, :, None] / few.width[:, None].clamp(min=1e-6)
     wrong = over & ((share < _PART_OF_LIT) | ((share > _SHADOWED[0]) & (share < _SHADOWED[1])))
     merit = torch.where(wrong.any(-1), _PART_MERIT * merit, merit)
@@ -200,7 +203,8 @@ def _best(
     listed = straight.pick(place.gather(1, index)[chosen][None])
     # Once more around lines through what was traced: the pair of Hough lines may have followed a short stretch only.
     traced = trace.trace(picture, listed, settings)
-    return StripCandidates(traced, listed.frame // picture.views, chosen, best, look(traced.strips))
+    number, lit = listed.frame // picture.views, picture.lit(listed)
+    return StripCandidates(traced, number, lit, chosen, best, look(traced.strips))
 
 
 def _lay_out(

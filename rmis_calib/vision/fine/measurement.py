@@ -107,11 +107,13 @@ def measure(images: Tensor, found: StripCandidates, lens: Lens, settings: Detect
     offered = edges.at_stations(trace.sides, trace.t, points.t)
     share = (fit.inliers / offered.sum(-1).clamp(min=1)).amin(-1)
     reach = math.hypot(*images.shape[-2:])
-    certain = confidence.capped(confidence.probability(confidence.features(trace, fit, share, reach)), trace)
+    network = found.verdict.shaft[None]
+    seen = confidence.features(trace, fit, share, reach, network, found.lit)
+    certain = confidence.capped(confidence.probability(seen), trace)
     convergence = (fit.slope[..., 0] - fit.slope[..., 1]).abs()
     cylinder = convergence < math.tan(math.radians(settings.max_convergence_deg))
     clear = cylinder & (share > 0.15) & (fit.spread_t.amin(-1) > 0)
-    plausible = confidence.plausible(trace, fit, share, reach)
+    plausible = confidence.plausible(trace, fit, share, reach, network)
     return MeasuredStrips(trace, strips, points, fit, end, expected, clear, plausible, certain)
 
 
