@@ -18,6 +18,8 @@ _ROWS = 11
 _REACH = 0.5
 """Rows lie within this share of the half width: beyond, the rim bends away and the shading of the limb begins."""
 _HALF = 40
+_DARKEST = 3, 11
+"""Ranks of the samples before the end, by brightness, whose mean is the shaft's colour."""
 _FIT = 7
 
 
@@ -117,10 +119,16 @@ def _darker_rows(values: Float[Tensor, "b k r ..."]) -> Float[Tensor, "b k ..."]
 
 
 def _separate(colours: Float[Tensor, "b k r n 3"], seen: Bool[Tensor, "b k n"]) -> Float[Tensor, "b k r n"]:
-    """Colours along the direction that leads from the shaft (first third) to what follows (last half)."""
+    """Colours along the direction that leads from the shaft, the darkest of the first half, to what follows.
+
+    A ball or a stain may take up most of what lies before the end.
+    """
     mean = torch.where(seen[..., None], _darker_rows(colours), torch.nan)
-    third = mean.shape[2] // 3
-    before = mean[:, :, :third].nanmedian(2).values
+    half, third = mean.shape[2] // 2, mean.shape[2] // 3
+    first = mean[:, :, :half]
+    tone = torch.where(seen[:, :, :half], first.sum(-1), torch.inf)
+    darkest = tone.argsort(dim=-1, stable=True)[..., _DARKEST[0] : _DARKEST[1], None].expand(-1, -1, -1, 3)
+    before = first.gather(2, darkest).nanmean(2)
     direction = torch.nan_to_num(mean[:, :, third:] - before[:, :, None])
     size = direction.norm(dim=-1, keepdim=True)
     main = (direction * size).sum(2)
