@@ -200,10 +200,10 @@ def _detect_views(
     cameras: list[_Camera], config: CalibrationConfig, progress: Progress, watch: Watch, detectors: Detectors
 ) -> tuple[View, ...]:
     """All cameras at once: their videos are decoded side by side, and the next batches while the last are searched."""
-    parts: dict[str, list[ShaftDetections]] = {camera.side: [] for camera in cameras}
+    tables: dict[str, ShaftDetections] = {}
     meters = {camera.side: ChangeMeter() for camera in cameras}
-    changes: dict[str, list[Tensor]] = {camera.side: [] for camera in cameras}
-    done = dict.fromkeys(parts, 0)
+    changes = {camera.side: torch.full((camera.source.count,), torch.inf) for camera in cameras}
+    done = dict.fromkeys(changes, 0)
     wanted = {camera.side: -(-camera.source.count // config.every) for camera in cameras}
     for camera in cameras:
         progress(camera.stage, 0, wanted[camera.side])
@@ -214,8 +214,12 @@ def _detect_views(
         def finish_one() -> None:
             camera, detector, batch, masks, future = running.popleft()
             found = future.result()
-            parts[camera.side].append(found)
-            changes[camera.side].append(meters[camera.side](batch.images))
+            # Into one table each: small tensors of every batch, kept, would scatter over memory between those that go.
+            if camera.side not in tables:
+                tables[camera.side] = over_all(found, camera.source.count, batch.indices)
+            for name, value in vars(tables[camera.side]).items():
+                value[batch.indices] = getattr(found, name)
+            changes[camera.side][batch.indices] = meters[camera.side](batch.images).cpu()
             watch(DetectedBatch(camera.side, camera.source, camera.times_s, detector, batch, masks, found))
             done[camera.side] += len(batch.indices)
             progress(camera.stage, done[camera.side], wanted[camera.side])
@@ -227,13 +231,7 @@ def _detect_views(
                 finish_one()
         while running:
             finish_one()
-    views = []
-    for c in cameras:
-        found = over_all(concatenate(parts[c.side]), c.source.count, slice(None, None, config.every))
-        change = torch.full((c.source.count,), torch.inf)
-        change[:: config.every] = torch.cat(changes[c.side]).cpu()
-        views.append(View(c.side, c.source, c.camera, found, change))
-    return tuple(views)
+    return tuple(View(c.side, c.source, c.camera, tables[c.side], changes[c.side]) for c in cameras)
 
 
 def _take_turns(
@@ -290,7 +288,7 @@ def concatenate(parts: list[ShaftDetections]) -> ShaftDetections:
     return ShaftDetections(**joined)
 
 
-def over_all(found: ShaftDetections, count: int, searched: slice | Tensor) -> ShaftDetections:
+def over_all(found: ShaftDetections, count: int, searched: Tensor) -> ShaftDetections:
     """Detections of the searched frames, as those of all `count` frames."""
     spread = {}
     for name, value in vars(found).items():
