@@ -135,7 +135,13 @@ def calibrate_views(
     run, about_rows = _with_rows_at_one_instant(run, draft, progress)
     run = _with_joint_offsets(run, config, progress)
     progress("checking", 0, 1)
-    run = with_misfit_named(run, config, lambda: _with_cameras_as_given(run, config), lambda: _with_clock(run, config))
+    run = with_misfit_named(
+        run,
+        config,
+        plainly=lambda: _with_cameras_as_given(run, config),
+        with_clock=lambda: _with_clock(run, config),
+        supposing=lambda other, quickly: _supposing(other or recording, run, config, quickly),
+    )
     run = run.with_notes((*recording.notes, *notes, *looks, *about_rows))
     run = with_next_motions(run, config)
     progress("checking", 1, 1)
@@ -197,7 +203,7 @@ def _without_joint_offsets(config: CalibrationConfig) -> CalibrationConfig:
     return config if config.solver.unknowns.joint_offsets != "auto" else _asking(config, joint_offsets="never")
 
 
-def _asking(config: CalibrationConfig, **unknowns: bool | str) -> CalibrationConfig:
+def _asking(config: CalibrationConfig, **unknowns: bool | str | float) -> CalibrationConfig:
     """The settings with these of its unknowns changed."""
     asked = replace(config.solver.unknowns, **unknowns)
     return replace(config, solver=replace(config.solver, unknowns=asked))
@@ -280,6 +286,22 @@ def _with_cameras_as_given(run: CalibrationRun, config: CalibrationConfig) -> Ca
 def _with_clock(run: CalibrationRun, config: CalibrationConfig) -> CalibrationRun:
     """The same choice solved with the clock among the unknowns, wherever it may be."""
     return _solve(run.recording, _asking(config, clock=True), run.views, run.told, run.choices, no_progress)
+
+
+def _supposing(recording: Recording, run: CalibrationRun, config: CalibrationConfig, quickly: bool) -> CalibrationRun:
+    """The same choice solved with what another recording says of joints and arms, and with few unknowns; `quickly` by
+    its lines alone, at the assumed noise and without outliers, which tells only how far pictures and joints are
+    apart."""
+    config = _asking(config, joint_offsets="never", rcm_offset="never", compliance="never", readout="never", doubt=0.0)
+    solver = replace(config.solver, groups=0, bias_correction=False)
+    if quickly:
+        noise = replace(solver.noise, estimate="never")
+        solver = replace(solver, noise=noise, robust="off", max_iterations=20, tolerance_sigma=0.1)
+        lines = tuple(kind for kind in config.measurements if kind in ("axis", "contours"))
+        config = replace(config, measurements=lines or config.measurements)
+    config, told = replace(config, solver=solver), motion_poses(recording, config.device)
+    rows = torch.as_tensor(np.searchsorted(run.told.frames, told.frames), device=config.device)  # maybe fewer motions
+    return _solve(recording, config, run.views, told, tuple(each.at(rows) for each in run.choices), no_progress)
 
 
 def _solve_again(

@@ -12,6 +12,7 @@ import data_synth
 import rmis_calib as rc
 from rmis_calib.config import parse_config
 from rmis_calib.pipeline.checks.misfit import SignedResiduals, misfit_message, shown_causes, traces
+from rmis_calib.pipeline.checks.suppositions import suppositions
 from rmis_calib.results import Motions, Nuisance
 from rmis_calib.solver.observability import Observability
 
@@ -127,17 +128,45 @@ def test_swapped_cameras_are_called_swapped(smooth, tmp_path) -> None:
     assert result.message.partition("Likely: ")[2].startswith("the left and the right pictures look swapped")
 
 
+def turned(header, rows):
+    column = header.index("instrument.yaw_rad")
+    return [[repr(-float(x)) if i == column else x for i, x in enumerate(row)] for row in rows]
+
+
 @pytest.mark.slow
-def test_a_joint_of_the_wrong_sign_is_a_misfit(smooth, tmp_path) -> None:
+def test_what_makes_joints_and_pictures_fit_is_named(smooth, tmp_path) -> None:
     folder = shutil.copytree(smooth, tmp_path / "recording")
-
-    def turned(header, rows):
-        column = next(i for i, name in enumerate(header) if name.startswith("instrument."))
-        return [[repr(-float(x)) if i == column else x for i, x in enumerate(row)] for row in rows]
-
     edited_joints(folder, turned)
     result = calibrated(folder)
     assert not result.trustworthy and "pictures and joints do not fit each other" in result.message
+    assert result.message.partition("Likely: ")[2].startswith("the sign of instrument.yaw")
+
+
+def test_each_supposition_changes_one_statement_back(smooth) -> None:
+    recording = rc.load_recording(smooth)
+    tried = {each.cause: each.recording for each in suppositions(recording, is_continuous=False)}
+    arms = ("laparoscope", "instrument")
+    for arm in arms:
+        for joint, sign in (("yaw_rad", -1), ("pitch_rad", -1), ("insertion_mm", -1)):
+            column = recording.joints.columns.index(f"{arm}.{joint}")
+            words = f"the sign of {arm}.{joint.rpartition('_')[0]}"
+            other = next(each for cause, each in tried.items() if cause.startswith(words))
+            changed = recording.joints.values.copy()
+            changed[:, column] *= sign
+            np.testing.assert_array_equal(other.joints.values, changed)
+    later = next(each for cause, each in tried.items() if "the joints of 1 picture later" in cause)
+    before, _ = recording.joints_at_frames("instrument")
+    after, known = later.joints_at_frames("instrument")
+    np.testing.assert_allclose(after[:-1][known[:-1]], before[1:][known[:-1]], rtol=1e-12)
+    assert known[:-1].all() and not known[-1]
+    yaw, pitch = (recording.joints.columns.index(f"instrument.{name}_rad") for name in ("yaw", "pitch"))
+    other = next(each for cause, each in tried.items() if cause.startswith("instrument.yaw and instrument.pitch are"))
+    np.testing.assert_array_equal(other.joints.values[:, [yaw, pitch]], recording.joints.values[:, [pitch, yaw]])
+    bases = [recording.robot.arms[arm].base_T_arm_base for arm in arms]
+    exchanged_bases = next(each for cause, each in tried.items() if cause.startswith("the bases"))
+    assert all(
+        exchanged_bases.robot.arms[arm].base_T_arm_base is base for arm, base in zip(arms, bases[::-1], strict=True)
+    )
 
 
 @pytest.mark.slow

@@ -18,6 +18,7 @@ from rmis_calib.pipeline.answer.run import CalibrationRun
 from rmis_calib.pipeline.arms.found_offsets import poses_at_motions
 from rmis_calib.pipeline.arms.kinematic_unknowns import KinematicUnknowns
 from rmis_calib.pipeline.checks.stereo_order import looks_swapped, median_inverse_depth
+from rmis_calib.pipeline.checks.suppositions import Supposing, fitting_causes
 from rmis_calib.pipeline.motions.association import Choice
 from rmis_calib.pipeline.motions.observations import ANOTHER_INSTRUMENT
 from rmis_calib.results import CalibrationResult
@@ -48,6 +49,7 @@ def with_misfit_named(
     config: CalibrationConfig,
     plainly: Callable[[], CalibrationRun],
     with_clock: Callable[[], CalibrationRun],
+    supposing: Supposing,
 ) -> CalibrationRun:
     """The run; a result that is not trustworthy as pictures and joints do not fit says so first, with the causes.
 
@@ -56,6 +58,8 @@ def with_misfit_named(
         config: of the calibration.
         plainly: solves the same with the cameras as given: where nothing fits, corrections of cameras hide the cause.
         with_clock: solves the same with the clock as an unknown.
+        supposing: solves the same with another recording's joints and robot (None: as they are) and with few unknowns,
+            and where the second argument is true, quickly.
     """
     result, solution = run.result, run.solution
     if solution is None or result.camera_right_T_arm is None or result.trustworthy:
@@ -65,7 +69,10 @@ def with_misfit_named(
         return run
     causes = _shown(run)
     if misfit:
-        causes = [*causes, *(_of_clock(config, with_clock) or _traces(run, config, plainly))] or [_OTHERWISE]
+        tried = _of_clock(config, with_clock)
+        if not tried and config.solver.method == "joint":
+            tried = fitting_causes(run, supposing, _noise, config.device)
+        causes = [*causes, *(tried or _traces(run, config, plainly))] or [_OTHERWISE]
         message = misfit_message(result, causes)
     else:
         causes = [*causes, *(() if result.tests is None else result.tests.causes)][:MOST_CAUSES]
@@ -84,6 +91,13 @@ def _of_clock(config: CalibrationConfig, with_clock: Callable[[], CalibrationRun
         return []
     offset_s = run.result.kinematic_offsets.clock[0]
     return [f"the clock or the frame rate: with the clock moved by {offset_s:+.3f} s they fit"]
+
+
+def _noise(result: CalibrationResult) -> float:
+    """Sum of the estimated levels, each in its limit; infinite where pictures and joints do not fit."""
+    if is_misfit(result):
+        return np.inf
+    return sum(float(result.nuisance(name)) / limit for name, limit in TOO_NOISY.items())
 
 
 def _traces(run: CalibrationRun, config: CalibrationConfig, plainly: Callable[[], CalibrationRun]) -> list[str]:

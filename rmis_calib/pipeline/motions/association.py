@@ -53,6 +53,10 @@ class Choice:
         """This choice in the motions that are known, none in the others."""
         return Choice(torch.where(known, self.candidate, -1), self.reversed & known)
 
+    def at(self, rows: Int[Tensor, " k"]) -> "Choice":
+        """This choice in some of the motions."""
+        return Choice(self.candidate[rows], self.reversed[rows])
+
     def same_as(self, other: "Choice") -> bool:
         return torch.equal(self.candidate, other.candidate) and torch.equal(self.reversed, other.reversed)
 

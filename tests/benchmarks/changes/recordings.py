@@ -217,7 +217,7 @@ CHANGES: dict[str, Change] = {
     "insertion 50.8 mm off": Change(column("instrument.insertion", lambda d: d + 50.8), "insertion|offset|tool"),
     "RCM 5 mm off": Change(robot(rcm_missed), "remote centre|RCM|rcm_frame|misses"),
     "clock 50 ms off": Change(times(lambda t: t + 0.05), "clock", needs="video"),
-    "one picture late": Change(late_by_one, "clock|order|log of another"),
+    "one picture late": Change(late_by_one, "clock|out of step"),
     "bases exchanged": Change(robot(bases_exchanged), "base", needs="laparoscope"),
     "degrees for radians": Change(column("_rad", np.rad2deg), "deg|range|unit"),
     "metres for millimetres": Change(column("_mm", lambda d: d / 1000), "metre| m |unit|range"),
