@@ -102,7 +102,9 @@ class Camera:
     def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> "Camera":
         """The same camera in another precision or on another device."""
         values = (self.fx, self.fy, self.cx, self.cy, self.distortion)
-        moved = (value.to(dtype=dtype, device=device) for value in values)
+        moved = [value.to(dtype=dtype, device=device) for value in values]
+        if all(new is old for new, old in zip(moved, values, strict=True)):
+            return self  # with what it has computed once
         return Camera(*moved, image_size=self.image_size, model=self.model)
 
     def corrected(self, focal: float, centre_x: float, centre_y: float, lens: float) -> "Camera":
@@ -113,6 +115,8 @@ class Camera:
             centre_x, centre_y: shift of the points, in focal lengths.
             lens: growth of the points by r^2 times this: k1, of whatever model, falls by it.
         """
+        if not (focal or centre_x or centre_y or lens):
+            return self
         fx, fy = self.fx / (1.0 + focal), self.fy / (1.0 + focal)
         only_k1 = torch.zeros_like(self.distortion)
         only_k1[0] = 1.0

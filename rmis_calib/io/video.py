@@ -91,6 +91,10 @@ class FrameSource:
             with decoding:
                 frames.close()
 
+    def has(self, index: int) -> bool:
+        """Whether there is such a frame to read."""
+        return 0 <= index < self.count
+
     def frame(self, index: int) -> UInt8[Tensor, "3 height width"]:
         """One frame by number, RGB on the CPU.
 

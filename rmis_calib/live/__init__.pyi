@@ -1,2 +1,2 @@
-from .session import LiveAnswer as LiveAnswer
+from .answer import LiveAnswer as LiveAnswer
 from .session import Session as Session

@@ -25,8 +25,9 @@ from rmis_calib.geometry.cameras import StereoRig
 from rmis_calib.io.recording import camera_rig
 from rmis_calib.io.robot import load_robot
 from rmis_calib.io.stereo import read_stereo
+from rmis_calib.live.answer import LiveAnswer
 from rmis_calib.live.collector import StillPose, StillPoses
-from rmis_calib.live.session import LiveAnswer, Session
+from rmis_calib.live.session import Session
 from rmis_calib.results import CalibrationResult
 
 UNCHECKED = "_unchecked"
@@ -42,9 +43,11 @@ PARAMETERS: dict[str, Any] = {
     "left_image": "",
     "arm_frame": "ECM",
     "camera_frame": "camera_right",
+    "picture_memory_mb": 1000.0,
     "out": "",
 }
 """Parameters with their defaults. `laparoscope_arm` empty: the camera stands still. `left_image` empty: one camera.
+`picture_memory_mb`: as of `Session`.
 `out`: file for result.json."""
 
 
@@ -152,6 +155,7 @@ def live_calibration(
         laparoscope_arm=laparoscope,
         instrument_arm=instrument,
         shaft_diameter_mm=parameters["shaft_diameter_mm"],
+        picture_memory_mb=parameters["picture_memory_mb"],
     )
     arms = [arm for arm in (laparoscope, instrument) if arm is not None]
     poses = StillPoses(robot, arms, ["right", *(["left"] if rig.left is not None else [])])

@@ -1,14 +1,15 @@
 """`rc.Session`: add a frame and joints, get the answer so far and the next useful motion.
 
-Between solves of all motions each new one moves the estimate by one step of an information filter. A live answer is
-never `ok`: it counts nominal noise and encoders without offsets. `result` solves everything and checks it.
+Between solves of all motions each new one moves the estimate by one step of an information filter. A picture that shows
+no shaft where the estimate puts it is looked at again there, as `calibrate` does; each solve of all motions starts from
+what was found without that. A live answer is never `ok`: it counts nominal noise and encoders without offsets. `result`
+solves everything and checks it.
 """
 
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -22,17 +23,19 @@ from rmis_calib.geometry.rigid import RigidTransform, rigid_from_rotation_transl
 from rmis_calib.io import Recording, load_recording
 from rmis_calib.io.robot import load_robot
 from rmis_calib.kinematics import RobotKinematics
+from rmis_calib.live.answer import LiveAnswer
 from rmis_calib.live.collected import Collected
 from rmis_calib.pipeline.answer.advice.candidates import at_found_setup
 from rmis_calib.pipeline.answer.advice.next_motions import with_next_motions
+from rmis_calib.pipeline.answer.guided_look import expected_contours, look_along
 from rmis_calib.pipeline.answer.run import CalibrationRun
-from rmis_calib.pipeline.arms.found_offsets import with_setup
-from rmis_calib.pipeline.arms.poses import MotionPoses, poses_of, predict_contours
-from rmis_calib.pipeline.calibration import calibrate_views, solve_choices
-from rmis_calib.pipeline.motions.association import associate, consistent_choice, read_prior
+from rmis_calib.pipeline.arms.found_offsets import with_rcm_offset, with_setup
+from rmis_calib.pipeline.arms.poses import MotionPoses, poses_of
+from rmis_calib.pipeline.calibration import calibrate_views
+from rmis_calib.pipeline.first_answer import first_answer, quick, without_false_candidates
+from rmis_calib.pipeline.motions.association import consistent_choice, read_prior
 from rmis_calib.pipeline.motions.observations import DIRECTION_UNKNOWN, assemble, problem_of
-from rmis_calib.pipeline.pictures.detection import no_progress
-from rmis_calib.pipeline.readiness import quick
+from rmis_calib.pipeline.pictures.detection import View, no_progress
 from rmis_calib.results import CalibrationResult
 from rmis_calib.robot import Robot
 from rmis_calib.solver import Problem
@@ -41,41 +44,16 @@ from rmis_calib.solver.assess.observability import assess
 from rmis_calib.solver.assess.update import add_motion
 from rmis_calib.solver.observability import Verdict
 from rmis_calib.solver.solution import Posterior
-from rmis_calib.vision import FrameReason, ShaftDetections, ShaftDetector
+from rmis_calib.vision import FrameReason, ShaftDetector
 
 SOLVE_AGAIN = 1.5
 """All motions are solved again when there are this many times more than at the last solve..."""
-CONTRADICTIONS = 3
-"""...or when this many frames in a row contradict the estimate."""
+CONTRADICTIONS, CONTRADICTING = 3, 0.1
+"""...or when this many frames in a row contradict the estimate, and this share of those used."""
+TRY_AGAIN = 1.2
+"""Without an estimate, there must be this many times more motions than at the last attempt."""
 CANDIDATES = 128
 """Random motions among which the next one is chosen: a tenth of what a calibration tries."""
-
-LiveStatus = Literal["collecting", "weak", "ready"]
-
-
-@dataclass(frozen=True)
-class LiveAnswer:
-    """What is known after a frame.
-
-    Attributes:
-        status: `collecting` (no estimate yet), `weak`, or `ready`: `result` is expected to be trustworthy.
-        message: one line: why.
-        frames: frames so far; used: those that show the shaft and agree.
-        frame_used: whether the last one did; frame_reason: why not, else empty.
-        camera_right_T_arm: the estimate, mm; None while collecting.
-        covariance: (6, 6) as in a result, for nominal noise and encoders without offsets.
-        advice: the motions that would help most, in words, as far as they are computed (`Session.advice` waits).
-    """
-
-    status: LiveStatus
-    message: str
-    frames: int
-    used: int
-    frame_used: bool
-    frame_reason: str
-    camera_right_T_arm: RigidTransform | None = None
-    covariance: Float[np.ndarray, "6 6"] | None = None
-    advice: tuple[str, ...] = ()
 
 
 class Session:
@@ -88,6 +66,7 @@ class Session:
         instrument_arm: name of the instrument's arm.
         shaft_diameter_mm: of the shaft.
         config: as for `calibrate`.
+        picture_memory_mb: room for pictures, to look at them again along later estimates; the oldest are forgotten.
     Raises:
         RobotError: the robot cannot carry these arms.
     """
@@ -101,11 +80,14 @@ class Session:
         instrument_arm: str = "instrument",
         shaft_diameter_mm: float = 8.0,
         config: CalibrationConfig | None = None,
+        picture_memory_mb: float = 1000.0,
     ) -> None:
         self._config = config or CalibrationConfig()
         described = load_robot(robot) if isinstance(robot, str) else robot
         self._kinematics = RobotKinematics(described, laparoscope_arm, instrument_arm, device=self._config.device)
-        self._collected = Collected(described, stereo, laparoscope_arm, instrument_arm, shaft_diameter_mm)
+        self._collected = Collected(
+            described, stereo, laparoscope_arm, instrument_arm, shaft_diameter_mm, picture_memory_mb
+        )
         self._detectors = {
             side: ShaftDetector(self._config.detector, camera.to(torch.float64, self._config.device))
             for side, camera in self._collected.cameras().items()
@@ -116,7 +98,9 @@ class Session:
         self._problem: Problem | None = None
         self._advising: Future[tuple[str, ...]] | None = None
         self._advice: tuple[str, ...] = ()
-        self._solved, self._used, self._contradictions = 0, 0, 0
+        # Motions that show a shaft, and those used at the last solve of all; frames that contradict it, in a row.
+        self._shown, self._tried, self._used, self._solved, self._contradictions = 0, 0, 0, 0, 0
+        self._prior = read_prior(self._config)
         advice = replace(self._config.solver.advice, candidates=CANDIDATES)
         self._quick = quick(replace(self._config, solver=replace(self._config.solver, advice=advice)))
 
@@ -162,11 +146,8 @@ class Session:
                 for side, images in pictures.items()}  # fmt: skip
         poses = self._poses(readings)
         found = {side: job.result() for side, job in jobs.items()}
-        self._collected.add(readings, poses, found)
-        reason = _reason(found)
-        if not reason:
-            reason = self._take(poses, found)
-        return self._answer(reason)
+        self._collected.add(readings, poses, found, pictures)
+        return self._answer(self._take(poses))
 
     def advice(self) -> tuple[str, ...]:
         """The motions that would help most, in words; waits for them where they are being computed."""
@@ -182,64 +163,84 @@ class Session:
         if not len(self._collected):
             raise InputError(where="session", expected="frames", found="none")
         recording, poses, views = self._collected.recording(), self._collected.poses(), self._collected.views()
-        return calibrate_views(recording, self._config, poses, views, read_prior(self._config)).result
+        return calibrate_views(recording, self._config, poses, views, self._prior).result
 
     def _poses(self, readings: Float[np.ndarray, " j"]) -> MotionPoses:
         values = torch.as_tensor(readings, device=self._config.device)[None]
         split = len(self._kinematics.laparoscope_joints)
-        return poses_of(self._kinematics, np.zeros(1, dtype=int), values[:, :split], values[:, split:])
+        number = np.array([len(self._collected)])
+        return poses_of(self._kinematics, number, values[:, :split], values[:, split:])
 
-    def _take(self, poses: MotionPoses, found: dict[str, ShaftDetections]) -> str:
+    def _take(self, poses: MotionPoses) -> str:
         """Let the last frame move the estimate; why it does not, else nothing."""
-        self._used += 1
-        if self._posterior is None or self._used >= SOLVE_AGAIN * self._solved:
-            return self._solve_all()
-        self._posterior, taken = add_motion(self._posterior, self._problem_of(poses, found), self._quick.solver)
+        views, _ = without_false_candidates(self._collected.views(), self._collected.poses())
+        if self._posterior is None:
+            reason = _reason(views, poses)
+            self._shown += not reason
+            self._used = self._shown
+            due = self._shown >= max(self._config.min_motions, TRY_AGAIN * self._tried)
+            return self._solve_all() if due and not reason else reason
+        run = self._with_motion(poses, views)
+        if self._config.look_again:
+            views = look_along(run, self._quick, no_progress, self._detectors) or views
+        reason = _reason(views, poses, is_expected=True)
+        if reason:
+            return reason
+        self._shown += 1
+        self._posterior, taken = add_motion(self._posterior, self._problem_of(run, views), self._quick.solver)
         if bool(taken.all()):
-            self._contradictions = 0
-            return ""
+            self._used, self._contradictions = self._used + 1, 0
+            return self._solve_all() if self._used >= SOLVE_AGAIN * self._solved else ""
         self._contradictions += 1
-        if self._contradictions >= CONTRADICTIONS:
+        if self._contradictions >= max(CONTRADICTIONS, CONTRADICTING * self._used):
             return self._solve_all()
-        self._used -= 1
         return "it contradicts the estimate so far: did the arms move, or is it another instrument?"
 
     def _solve_all(self) -> str:
         """Solve all motions so far; why the last frame is not among them, else nothing."""
-        if self._used < self._config.min_motions:
-            return ""
         recording, poses, views = self._collected.recording(), self._collected.poses(), self._collected.views()
-        attempts, _ = associate(recording, self._quick, poses, views, read_prior(self._config))
-        run = solve_choices(recording, self._quick, views, poses, attempts, no_progress)
+        run = first_answer(recording, self._quick, poses, views, self._prior, with_pictures=self._config.look_again).run
         self._run, self._contradictions, self._posterior, self._problem = run, 0, None, None
+        self._tried = self._used = self._shown
         if run.solution is not None and run.observations is not None and run.result.status != "solver_failed":
             self._posterior = run.solution.posterior
             self._problem = at_found_setup(problem_of(run.observations, self._quick).flatten_batch(), run.solution)
             # Ten times as long as the solve: it goes on while the arms move to their next place.
             self._advising = self._executor.submit(_advice, run, self._quick)
-        self._used = self._solved = max(int(run.result.motions.used.sum()), 1)
+            self._used = self._solved = max(int(run.result.motions.used.sum()), 1)
         return "" if run.result.motions.used[-1] else run.result.motions.reasons[-1]
 
-    def _problem_of(self, poses: MotionPoses, found: dict[str, ShaftDetections]) -> Problem:
+    def _with_motion(self, poses: MotionPoses, views: tuple[View, ...]) -> CalibrationRun:
+        """The last frame's motion alone, with the estimate so far."""
+        assert self._posterior is not None and self._run is not None and self._run.solution is not None
+        state, run = self._posterior.state, self._run
+        right_T_arm = rigid_from_rotation_translation(state.R, state.t)[0].detach().cpu()
+        known = {"camera_right_T_arm": RigidTransform("camera_right", self._run.solution.frame, right_T_arm)}
+        if len(views) == 2:
+            camera_left_T_camera_right = (
+                rigid_from_rotation_translation(state.stereo_R, state.stereo_t)[0].detach().cpu()
+            )
+            known["camera_left_T_camera_right"] = RigidTransform(
+                "camera_left", "camera_right", camera_left_T_camera_right
+            )
+        offsets = run.result.kinematic_offsets
+        placed = with_rcm_offset(with_setup(poses, offsets), offsets.rcm_mm)
+        return replace(run, result=replace(run.result, **known), views=views, told=poses, poses=placed, choices=())
+
+    def _problem_of(self, run: CalibrationRun, views: tuple[View, ...]) -> Problem:
         """The last frame's measurements, of the candidate nearest to where the estimate puts the shaft."""
-        assert self._posterior is not None and self._run is not None
-        state = self._posterior.state
-        camera_T_arm = {"right": rigid_from_rotation_translation(state.R, state.t)[0]}
-        if "left" in found:
-            camera_left_T_camera_right = rigid_from_rotation_translation(state.stereo_R, state.stereo_t)[0]
-            camera_T_arm["left"] = camera_left_T_camera_right @ camera_T_arm["right"]
-        radius_mm = float(state.radius.reshape(-1)[0])
-        views = tuple(self._collected.view(side, [detections]) for side, detections in found.items())
+        assert run.solution is not None
         # Three times the same motion, of which one is kept: observations of fewer than three are refused.
-        thrice = _repeated(poses, 3)
-        placed = with_setup(thrice, self._run.result.kinematic_offsets)
-        choices = tuple(
-            consistent_choice(view.at(thrice.frames), predict_contours(camera_T_arm[view.side], placed, radius_mm))
-            for view in views
-        )
-        observations = assemble(self._run.recording, thrice, views, choices, self._quick)
+        thrice = _repeated(run.told, 3)
+        placed = with_setup(thrice, run.result.kinematic_offsets)
+        choices = []
+        for view in views:
+            expected = expected_contours(run, view)
+            assert expected is not None
+            choices.append(consistent_choice(view.at(thrice.frames), expected.expand(3, -1, -1)))
+        observations = assemble(run.recording, placed, views, tuple(choices), self._quick)
         problem = problem_of(observations, self._quick).flatten_batch().select_motions(slice(0, 1))
-        return problem if self._run.solution is None else at_found_setup(problem, self._run.solution)
+        return at_found_setup(problem, run.solution)
 
     def _known_advice(self) -> tuple[str, ...]:
         """The advice of the last solve whose advice is there."""
@@ -280,9 +281,11 @@ def _repeated(poses: MotionPoses, times: int) -> MotionPoses:
     return replace(poses, frames=np.repeat(poses.frames, times), **tensors)
 
 
-def _reason(found: dict[str, ShaftDetections]) -> str:
-    """Why no camera shows a shaft; empty where one does."""
-    if any(bool((detections.valid & detections.direction_known).any()) for detections in found.values()):
+def _reason(views: tuple[View, ...], poses: MotionPoses, is_expected: bool = False) -> str:
+    """Why no camera shows a shaft in the last frame; empty where one does. Where a shaft is expected, the side of its
+    tip need not be seen."""
+    found = [view.at(poses.frames) for view in views]
+    if any(bool((each.valid & (each.direction_known | is_expected)).any()) for each in found):
         return ""
-    code = FrameReason(int(next(iter(found.values())).reason[0]))
+    code = FrameReason(int(found[0].reason[0]))
     return DIRECTION_UNKNOWN if code is FrameReason.OK else code.sentence

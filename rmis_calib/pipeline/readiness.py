@@ -4,7 +4,7 @@ A few frames are searched; the pose that they give predicts what all motions wou
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,15 +20,14 @@ from rmis_calib.pipeline.answer.advice.next_motions import camera_view, may_advi
 from rmis_calib.pipeline.answer.run import CalibrationRun
 from rmis_calib.pipeline.arms.kinematic_unknowns import KinematicUnknowns
 from rmis_calib.pipeline.arms.poses import MotionPoses, motion_poses
-from rmis_calib.pipeline.calibration import solve_choices
 from rmis_calib.pipeline.checks.findings import Finding, about_motions, about_order, about_pictures
 from rmis_calib.pipeline.device import require_device
-from rmis_calib.pipeline.motions.association import associate, read_prior
+from rmis_calib.pipeline.first_answer import FirstAnswer, rough_answer
+from rmis_calib.pipeline.motions.association import read_prior
 from rmis_calib.pipeline.motions.observations import problem_of
-from rmis_calib.pipeline.pictures.detection import View, no_progress, over_all
-from rmis_calib.pipeline.pictures.frozen import ChangeMeter, about_repeats, repeated_motions
+from rmis_calib.pipeline.pictures.detection import View, over_all
+from rmis_calib.pipeline.pictures.frozen import ChangeMeter, about_repeats, repeated_motions, without_frames
 from rmis_calib.pipeline.pictures.masks import MaskReader, open_masks
-from rmis_calib.solver import SolveStatus
 from rmis_calib.solver.assess.information import inverse
 from rmis_calib.solver.assess.next_motion import measured_alike, predicted_information
 from rmis_calib.solver.assess.observability import assess
@@ -85,9 +84,10 @@ def check(recording: Recording | str | Path, config: CalibrationConfig | None = 
     if not len(poses.frames):
         return RecordingCheck(tuple(findings), opened.notes)
     looked, views, repeats = _look(opened, poses, config)
-    findings += about_pictures(views, looked, repeats)
-    run = _rough(opened, config, poses, views, looked)
-    findings += about_order(opened, poses, views, run.choices)
+    first = _rough(opened, config, poses, views, looked)
+    run = first.run
+    findings += about_pictures(first.searched, run.views, looked, repeats)
+    findings += about_order(opened, run.poses, run.views, run.choices)
     if any(finding.is_doubt and finding.topic != "clocks" for finding in findings):
         return RecordingCheck(tuple(findings), opened.notes)
     expected, sigma = _expected(run, config)
@@ -135,9 +135,11 @@ def _look(
         for side, (source, camera) in sources.items():
             found, change = jobs[side][0].result(), torch.full((source.count,), torch.inf)
             change[torch.as_tensor(few.frames)] = jobs[side][1]
-            views.append(View(side, source, camera, over_all(found, source.count, index), change))
             frames = few.frames[repeated_motions(change, few)]
             repeats += [about_repeats(side, frames)] if len(frames) else []
+            detections = without_frames(over_all(found, source.count, index), frames)
+            # Of the frames looked at, none is the one before another: their change says nothing of these alone.
+            views.append(View(side, source, camera, detections, torch.full_like(change, torch.inf)))
     return looked, tuple(views), repeats
 
 
@@ -156,31 +158,11 @@ def _detections(
 
 def _rough(
     recording: Recording, config: CalibrationConfig, poses: MotionPoses, views: tuple[View, ...], looked: np.ndarray
-) -> CalibrationRun:
+) -> FirstAnswer:
     """A calibration from the frames looked at: good enough to predict what all would tell."""
     known = torch.as_tensor(np.isin(poses.frames, looked), device=poses.arm_T_rcm.device)
-    few = poses.select(known)
-    attempts, _ = associate(recording, config, few, views, read_prior(config))
-    rough = quick(config)
-    run = solve_choices(recording, rough, views, few, attempts, no_progress)
-    if run.solution is None or SolveStatus(int(run.solution.status)) is not SolveStatus.MISFIT:
-        return run
-    # A robot less exact than assumed is no misfit: its noise is then estimated, as `calibrate` does.
-    rough = replace(rough, solver=replace(rough.solver, noise=config.solver.noise))
-    return solve_choices(recording, rough, views, few, attempts, no_progress)
-
-
-def quick(config: CalibrationConfig) -> CalibrationConfig:
-    """The configuration of a rough estimate: nominal noise, no offsets, none of the checks."""
-    solver = config.solver
-    plain = replace(
-        solver,
-        unknowns=replace(solver.unknowns, joint_offsets="never", clock=False),
-        noise=replace(solver.noise, estimate="never"),
-        groups=0,
-        bias_correction=False,
-    )
-    return replace(config, solver=plain)
+    look_again = config.look_again and config.masks is None
+    return rough_answer(recording, config, poses.select(known), views, read_prior(config), look_again)
 
 
 def _expected(run: CalibrationRun, config: CalibrationConfig) -> tuple[Finding, tuple[float | None, float | None]]:

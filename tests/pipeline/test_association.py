@@ -14,7 +14,8 @@ from rmis_calib.errors import InputError
 from rmis_calib.geometry.lines import contour_planes
 from rmis_calib.pipeline.answer.guided_look import about_looks, expected_contours, look_along
 from rmis_calib.pipeline.arms.poses import motion_poses
-from rmis_calib.pipeline.calibration import better_choices, run_calibration
+from rmis_calib.pipeline.calibration import run_calibration
+from rmis_calib.pipeline.first_answer import better_choices
 from rmis_calib.pipeline.motions.association import (
     association_gate,
     choices_by_instrument,

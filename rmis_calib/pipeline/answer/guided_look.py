@@ -1,5 +1,6 @@
 """A second look at the pictures, along the contours that a first answer predicts."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import torch
@@ -23,11 +24,22 @@ _SPAN_MM = 30.0
 """Between two points of a contour by which it is carried from one camera to the other."""
 
 
-def look_along(run: CalibrationRun, config: CalibrationConfig, progress: Progress) -> tuple[View, ...] | None:
+def look_along(
+    run: CalibrationRun,
+    config: CalibrationConfig,
+    progress: Progress,
+    detectors: Mapping[str, ShaftDetector] | None = None,
+) -> tuple[View, ...] | None:
     """The views with what is found where the answer puts the shaft, in pictures that show nothing there so far; None
     where nothing is.
 
     Nothing is taken away: candidates that lie elsewhere still speak against the answer.
+
+    Args:
+        run: with the answer.
+        config: its configuration.
+        progress: called with (stage, done, total).
+        detectors: of each side, where there are some; else they are made.
     """
     views, gained = [], 0
     for view in run.views:
@@ -35,7 +47,8 @@ def look_along(run: CalibrationRun, config: CalibrationConfig, progress: Progres
         if expected is None:
             return None
         wanted = _in_view(run, view) & ~_has_near(view.at(run.poses.frames), expected)
-        detections, found = _with_looks(view, run, expected, wanted, config, progress)
+        detector = ShaftDetector(config.detector, view.camera) if detectors is None else detectors[view.side]
+        detections, found = _with_looks(view, run, expected, wanted, detector, config, progress)
         views.append(replace(view, detections=detections))
         gained += found
     return tuple(views) if gained else None
@@ -52,6 +65,8 @@ def expected_contours(run: CalibrationRun, view: View) -> Float[Tensor, "m 2 3"]
     corrected = run.camera(view)
     if predicted is None or ends is None or camera_T_arm is None or view.camera is None or corrected is None:
         return None
+    if corrected is view.camera:
+        return predicted
     found, given = (camera.to(dtype=ends.dtype, device=ends.device) for camera in (corrected, view.camera))
     camera_v_axis = rotate_vectors(camera_T_arm @ run.poses.arm_T_rcm, run.poses.rcm_v_axis)
     axis = torch.stack([ends - _SPAN_MM * camera_v_axis, ends], 1)[:, None]  # (m, 1, point, 3)
@@ -104,14 +119,15 @@ def _with_looks(
     run: CalibrationRun,
     expected: Float[Tensor, "m 2 3"],
     wanted: Bool[Tensor, " m"],
+    detector: ShaftDetector,
     config: CalibrationConfig,
     progress: Progress,
 ) -> tuple[ShaftDetections, int]:
     """The detections of all frames with those of the wanted motions, and of how many motions there are such."""
-    detector = ShaftDetector(config.detector, view.camera)
     not_to_be_used = view.detections.reason.new_tensor([FrameReason.LEFT_OUT, FrameReason.REPEATED])
     searched = ~torch.isin(view.detections.reason, not_to_be_used)
-    motions = [m for m in wanted.nonzero()[:, 0].tolist() if searched[run.poses.frames[m]]]
+    frames = run.poses.frames.tolist()
+    motions = [m for m in wanted.nonzero()[:, 0].tolist() if searched[frames[m]] and view.source.has(frames[m])]
     if not motions:
         return view.detections, 0
     fields = {name: value.clone() for name, value in vars(view.detections).items()}

@@ -59,18 +59,24 @@ def about_motions(recording: Recording, poses: MotionPoses, config: CalibrationC
     return found
 
 
-def about_pictures(views: tuple[View, ...], looked: np.ndarray, repeats: list[str]) -> list[Finding]:
+def about_pictures(
+    searched: tuple[View, ...], views: tuple[View, ...], looked: np.ndarray, repeats: list[str]
+) -> list[Finding]:
     """Whether the shaft is found and pictures repeat.
 
     Args:
-        views: detections of every frame.
+        searched: detections of every frame.
+        views: the same after looking again where a first answer puts the shaft.
         looked: numbers of the frames that were searched.
         repeats: notes about pictures that repeat others (`about_repeats`).
     """
     found = [Finding("repeated", note, is_doubt=True) for note in repeats]
-    for view in views:
-        shows = int(view.found[torch.as_tensor(looked, device=view.found.device)].sum())
-        sentence = f"camera_{view.side}: found in {shows} of {len(looked)} frames looked at"
+    for first, second in zip(searched, views, strict=True):
+        index = torch.as_tensor(looked, device=first.found.device)
+        alone, shows = (int(view.found[index].sum()) for view in (first, second))
+        sentence = f"camera_{first.side}: found in {shows} of {len(looked)} frames looked at"
+        if shows > alone:
+            sentence += f", in {shows - alone} of them only by looking again where a first answer puts it"
         found.append(Finding("shaft", sentence, shows < _RARELY_FOUND * len(looked)))
     return found
 

@@ -36,7 +36,7 @@ def picture_edges(run: CalibrationRun) -> tuple[ViewEdges, ...]:
     found = []
     for view, choice in zip(run.views, run.choices, strict=True):
         used = run.result.motions.used[run.poses.frames] & choice.taken.cpu().numpy()
-        motions = np.flatnonzero(used)
+        motions = np.array([m for m in np.flatnonzero(used) if view.source.has(int(run.poses.frames[m]))], dtype=int)
         motions = motions[np.unique(np.linspace(0, len(motions) - 1, min(len(motions), MOST_MOTIONS)).astype(int))]
         camera = run.camera(view)
         if camera is not None and len(motions):
