@@ -37,7 +37,7 @@ def test_each_cause_is_told_from_its_trace(seed) -> None:
 
 def test_pictures_show_swapped_cameras_and_repeats() -> None:
     assert shown_causes(0.02, 0) == shown_causes(None, 0) == []
-    assert SWAPPED in shown_causes(-0.02, 0)[0]
+    assert SWAPPED in shown_causes(-0.02, 0)[0] and "mirrored" in shown_causes(-0.02, 0)[0]
     assert shown_causes(-0.02, 7)[0].startswith("7 pictures repeat the one before")
 
 

@@ -140,7 +140,7 @@ def shown_causes(inverse_depth: float | None, repeated: int) -> list[str]:
     if repeated:
         causes.append(f"{repeated} pictures repeat the one before (a frame grabber that stalls)")
     if looks_swapped(inverse_depth):
-        causes.append("the left and the right pictures look swapped")
+        causes.append("the left and the right pictures look swapped, or each is mirrored")
     return causes
 
 

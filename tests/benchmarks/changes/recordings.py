@@ -213,7 +213,7 @@ CHANGES: dict[str, Change] = {
     "diameter 10 % off": Change(lambda folder: edited(folder / "recording.yaml", larger_radius), "diameter|radius"),
     "yaw's sign": Change(column("instrument.yaw", np.negative), "sign"),
     "pitch's sign": Change(column("instrument.pitch", np.negative), "sign"),
-    "yaw and pitch exchanged": Change(joints(joints_exchanged), "order"),
+    "yaw and pitch exchanged": Change(joints(joints_exchanged), "exchanged"),
     "insertion 50.8 mm off": Change(column("instrument.insertion", lambda d: d + 50.8), "insertion|offset|tool"),
     "RCM 5 mm off": Change(robot(rcm_missed), "remote centre|RCM|rcm_frame|misses"),
     "clock 50 ms off": Change(times(lambda t: t + 0.05), "clock", needs="video"),
