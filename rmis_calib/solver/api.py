@@ -10,7 +10,7 @@ from torch import Tensor
 from rmis_calib.errors import InputError, InsufficientDataError, ObservationsError
 from rmis_calib.geometry.rigid import rigid_from_rotation_translation
 from rmis_calib.solver.assess.assemble import joint_on_graph, joint_solution
-from rmis_calib.solver.assess.evidence import freed_next, weigh
+from rmis_calib.solver.assess.evidence import CHANCE, weigh
 from rmis_calib.solver.assess.information import motion_information, select_d_optimal
 from rmis_calib.solver.assess.left_out import freed
 from rmis_calib.solver.assess.observability import SHOWN_MOTIONS
@@ -101,11 +101,13 @@ def _solve_by_evidence(
     alternative: AlternativeModel | None = None,
 ) -> Solution:
     """Trials that are solved together; where the data ask for an unknown that was left out, they are solved again with
-    it, one after the other (`freed_next`)."""
+    it, that of least chance first."""
     solution = _solve_flat(flat, settings, method, kinematics, alternative)
     if not solution.evidence:
         return solution
-    names, which = list(solution.evidence), freed_next(solution.evidence)
+    names = list(solution.evidence)
+    chances_of = torch.stack([solution.evidence[name] / CHANCE[name] for name in names])
+    which = torch.where(chances_of.amin(0) < 1.0, chances_of.argmin(0), -1)
     if bool((which < 0).all()):
         return solution
     parts, order = [], []

@@ -12,13 +12,13 @@ nothing of the set-up at all. There the unknown is considered: it is off by abou
 data change as far as they see it (Bayesian model averaging: Hoeting et al. 1999), and the covariance allows for that.
 
 Freeing an unknown that is nominal costs sigma, and believing in one that is not costs the truth, so the tests are loose
-ones, and the candidate of least chance is freed first; those of timing before all others.
+ones, and the candidate of least chance is freed first.
 """
 
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.special import fdtrc
 from torch import Tensor
 
@@ -34,12 +34,6 @@ from rmis_calib.solver.settings import SolverSettings
 
 CHANCE = {"clock_rate": 0.005, "readout": 0.005, "setup": 0.02, "rcm_offset": 0.02, "compliance": 1e-4}
 """Probability, with everything nominal, from which an unknown is freed: less for what costs more."""
-TIMING = ("clock_rate", "readout")
-"""One number each, of a clock and of a camera. What an arm gives way has 70 coefficients, which take up what such a
-number leaves in the residuals: asked together, rows that are read one after the other look like an arm that gives
-way."""
-HINT = 0.1
-"""Chance of one of timing from which it is freed before an arm that gives way."""
 SEEN = 2.0
 """Information on a direction, in that of the prior, from which it counts."""
 
@@ -91,22 +85,6 @@ def weigh(fit: MapEstimate, settings: SolverSettings) -> Evidence:
         size = considered(candidates.nominal, asked, name, sigma)
         doubt[name] = doubt_of(block, sigma, size, inflation, belief_in(name, asked))
     return Evidence(chance, doubt)
-
-
-def freed_next(chance: dict[str, Float[Tensor, " b"]]) -> Int[Tensor, " b"]:
-    """Which unknown the data of each trial ask for, by its place in `chance`; -1: none.
-
-    That of least chance beside its CHANCE, of those of timing if there is one; before an arm that gives way, one of
-    timing that there is a HINT of.
-    """
-    value = torch.stack([*chance.values()])
-    over = value / value.new_tensor([CHANCE[name] for name in chance])[:, None]
-    asked = over < 1.0
-    timing = torch.tensor([name in TIMING for name in chance], device=value.device)[:, None]
-    gives_way = asked[list(chance).index("compliance")] if "compliance" in chance else asked[0] & False
-    first = timing & (asked | ((value < HINT) & gives_way))
-    eligible = torch.where(first.any(0), first, asked)
-    return torch.where(asked.any(0), torch.where(eligible, over, torch.inf).argmin(0), -1)
 
 
 def _may_be_read_later(fit: MapEstimate) -> bool:

@@ -80,8 +80,8 @@ class _Draws:
 
 
 def simulate(measured: MeasurementRows, state: State, noise: NoiseModel, draws: "_Draws") -> MeasurementRows:
-    """The measurements that the state and the measured kinematics predict, all rows read at once, with noise of the
-    model and these draws added."""
+    """The measurements that the state and the measured kinematics predict, with noise of the model and these draws
+    added."""
 
     def scaled(variance: Tensor, draw: Tensor) -> Tensor:
         return variance.sqrt()[:, None] * draw
@@ -128,13 +128,6 @@ def simulate(measured: MeasurementRows, state: State, noise: NoiseModel, draws: 
     return replace(simulated, own=tuple(own))
 
 
-def _read_at_once(state: State) -> State:
-    """The state of cameras that read all rows at once, as `simulate` does: what reading them later adds to measurements
-    and to predictions alike leaves no residual. Simulated without it but predicted with it, it looks like a bias, and a
-    readout that is estimated comes out twice as long."""
-    return replace(state, readout=torch.zeros_like(state.readout))
-
-
 def _uncorrected(xy: Float[Tensor, "2 c b n"], state: State) -> Float[Tensor, "2 c b n"]:
     """The points whose correction these are, to first order."""
     return 2.0 * xy - corrected_points(xy, state)
@@ -147,7 +140,7 @@ def simulated_pairs(
     the other."""
     generator = torch.Generator(device=model.measured.p.device).manual_seed(seed)
     twice = torch.arange(model.measured.trials, device=model.measured.p.device).repeat(2)
-    both, at = model.take_trials(twice), _read_at_once(state).take(twice)
+    both, at = model.take_trials(twice), state.take(twice)
     for _ in range(repeats):
         draws = _Draws(model.measured, generator)
         yield replace(both, measured=simulate(both.measured, at, both.noise, draws)), at
@@ -170,7 +163,7 @@ def expected_score(model: WeightedModel, state: State, simulated_motions: int, s
     for trials, along in picked.parts():
         generator.set_state(drawn)
         twice = torch.arange(trials.stop - trials.start, device=like.device).repeat(2)
-        at = _read_at_once(state).take(trials).take(twice)
+        at = state.take(trials).take(twice)
         for motions in along:
             part = picked.narrow(trials, motions)
             both = part.take_trials(twice)

@@ -10,7 +10,6 @@ import torch
 from rmis_calib.geometry.rotations import matrix_to_rotvec
 from rmis_calib.solver import Problem, solve
 from rmis_calib.solver.assess.doubt import part_that_covers
-from rmis_calib.solver.assess.evidence import freed_next
 from rmis_calib.solver.settings import SolverSettings
 from tests.benchmarks.bench_solver_misspecified import CAMERAS, ERRORS, INSIDE_95, scene
 
@@ -109,15 +108,3 @@ def test_doubt_of_what_the_data_see_is_small():
     gained = doubt.diagonal(dim1=-2, dim2=-1)
     for variance, more in ((mm2, gained[:, 3:].sum(-1)), (deg2, gained[:, :3].sum(-1))):
         assert float((variance / (variance - more)).sqrt().median()) < 1.25
-
-
-def test_one_number_of_timing_comes_before_what_an_arm_gives_way():
-    """Of six trials: by hand, from the chances 0.02, 0.005 and 1e-4 below which these are freed; where compliance is
-    asked for, 0.1 suffices of readout."""
-    chance = {
-        "setup": torch.tensor([0.5, 0.001, 0.5, 0.001, 0.019, 0.5]),
-        "readout": torch.tensor([0.5, 0.004, 0.004, 0.006, 0.006, 0.11]),
-        "compliance": torch.tensor([0.5, 1e-9, 1e-9, 1e-3, 9e-5, 9e-5]),
-    }
-    assert freed_next(chance).tolist() == [-1, 1, 1, 0, 1, 2]
-    assert freed_next({"setup": chance["setup"]}).tolist() == [-1, 0, -1, 0, 0, -1]
