@@ -14,6 +14,7 @@ class SolveStatus(IntEnum):
     BEHIND_CAMERA = 5
     INCONSISTENT = 6
     MISFIT = 7
+    NO_CAMERA = 8
 
     @property
     def sentence(self) -> str:
@@ -27,6 +28,7 @@ _SENTENCES = {
     SolveStatus.NON_FINITE: "a residual became infinite or undefined",
     SolveStatus.SINGULAR: "the measurements leave a direction of the transform entirely undetermined",
     SolveStatus.BEHIND_CAMERA: "the best fit puts the shaft behind the camera or its tip on the wrong side",
+    SolveStatus.NO_CAMERA: "the estimate leaves a camera without a positive focal length",
     SolveStatus.MISFIT: "the residuals are larger than the noise levels explain",
     SolveStatus.INCONSISTENT: (
         "a camera has more measurements that contradict the transform than agree with it (are the cameras swapped?)"

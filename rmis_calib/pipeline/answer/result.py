@@ -58,16 +58,16 @@ def make_result(
         *about_setup(solution, frame, config.solver.unknowns),
         *about_compliance(solution),
     )
-    finite = bool(torch.isfinite(solution.camera_right_T_arm).all())
+    usable = int(solution.status) != SolveStatus.NO_CAMERA and bool(torch.isfinite(solution.camera_right_T_arm).all())
     covariance = solution.covariance.cpu().numpy()
     stereo = solution.camera_left_T_camera_right
     return CalibrationResult(
         status=status,
         message=message,
         method=solution.method,
-        camera_right_T_arm=_transform("camera_right", frame, solution.camera_right_T_arm) if finite else None,
+        camera_right_T_arm=_transform("camera_right", frame, solution.camera_right_T_arm) if usable else None,
         camera_left_T_camera_right=None if stereo is None else _transform("camera_left", "camera_right", stereo),
-        covariance=covariance if np.isfinite(covariance).all() else None,
+        covariance=covariance if usable and np.isfinite(covariance).all() else None,
         observability=replace(observability, sentences=(*observability.sentences, *notes)),
         motions=motions,
         residuals=residuals,

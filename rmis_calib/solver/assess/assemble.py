@@ -208,4 +208,7 @@ def _judge(fit: MapEstimate) -> tuple[Int[Tensor, " b"], Int[Tensor, "b n"], Flo
         (excess > MAX_CHI2_PER_DOF, SolveStatus.MISFIT),
     ):
         status = torch.where(wrong & (status == SolveStatus.CONVERGED), code, status)
+    # A correction of the points' scale beyond that turns the camera inside out: nothing can be predicted with it.
+    inside_out = (fit.state.intrinsics[..., 0] <= -1.0).any(-1)
+    status = torch.where(inside_out, int(SolveStatus.NO_CAMERA), status)
     return status, reason, excess
