@@ -142,6 +142,17 @@ def test_what_makes_joints_and_pictures_fit_is_named(smooth, tmp_path) -> None:
     assert result.message.partition("Likely: ")[2].startswith("the sign of instrument.yaw")
 
 
+@pytest.mark.slow
+def test_a_joint_that_turns_the_other_way_is_named_where_only_tests_of_residuals_fail(shared_data, tmp_path) -> None:
+    """One camera that stands still: either sign, or a mirror, explains everything but the contours' shape."""
+    folder = shutil.copytree(shared_data / "recode_recording", tmp_path / "recording")
+    edited_joints(folder, turned)
+    result = rc.calibrate(rc.load_recording(folder), throw=False)
+    assert not result.trustworthy
+    causes = result.message.partition("Likely: ")[2]
+    assert "the sign of instrument.yaw, or mirrored pictures" in causes
+
+
 def test_each_supposition_changes_one_statement_back(smooth) -> None:
     recording = rc.load_recording(smooth)
     tried = {each.cause: each.recording for each in suppositions(recording, is_continuous=False)}

@@ -68,14 +68,14 @@ def with_misfit_named(
     if not misfit and (result.tests is None or not result.tests.failed):
         return run
     causes = _shown(run)
+    tried = _of_clock(config, with_clock) if misfit else []
+    if not tried and config.solver.method == "joint":
+        tried = fitting_causes(run, supposing, _noise, config.device, only_tests_fail=not misfit)
     if misfit:
-        tried = _of_clock(config, with_clock)
-        if not tried and config.solver.method == "joint":
-            tried = fitting_causes(run, supposing, _noise, config.device)
         causes = [*causes, *(tried or _traces(run, config, plainly))] or [_OTHERWISE]
         message = misfit_message(result, causes)
     else:
-        causes = [*causes, *(() if result.tests is None else result.tests.causes)][:MOST_CAUSES]
+        causes = [*causes, *tried, *(() if result.tests is None else result.tests.causes)][:MOST_CAUSES]
         head = result.message.partition(_LIKELY)[0]
         message = f"{head}{_LIKELY.lstrip('.') if head.endswith('?') else _LIKELY}{_THEN.join(causes)}"
     tests = None if result.tests is None else replace(result.tests, causes=tuple(causes))

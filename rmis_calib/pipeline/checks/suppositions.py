@@ -18,8 +18,9 @@ from rmis_calib.results import CalibrationResult
 
 MOST_TRIED = 3
 """Causes that are tried in full, and named."""
-MENDED = 0.5
-"""Part of the distance between pictures and joints that may be left of it when a cause is put right."""
+MENDED, CLOSER = 0.5, 0.8
+"""Part of the distance between pictures and joints that may be left of it when a cause is put right: where they did not
+fit at all, and where they do but for tests of residuals."""
 ALIKE = 1.5
 """Causes that leave at most this times the noise of the best cannot be told from it: in the pictures of one camera that
 stands still, the sign of either rotation of the instrument, and a mirror."""
@@ -41,19 +42,25 @@ class Supposition:
 
 
 def fitting_causes(
-    run: CalibrationRun, supposing: Supposing, noise_of: Callable[[CalibrationResult], float], device: str
+    run: CalibrationRun,
+    supposing: Supposing,
+    noise_of: Callable[[CalibrationResult], float],
+    device: str,
+    only_tests_fail: bool = False,
 ) -> list[str]:
     """What makes everything fit once it is put right, and what cannot be told from it.
 
     Args:
-        run: in which pictures and joints do not fit.
+        run: in which pictures and joints do not fit, or tests of residuals fail.
         supposing: solves the same otherwise.
         noise_of: how large the estimated noise of a result is; infinite where pictures and joints do not fit in it.
         device: where kinematics are evaluated.
+        only_tests_fail: pictures and joints fit as they are. Then a cause has to let all tests pass: what brings them a
+            little nearer only may be chance.
     """
     is_continuous = KinematicUnknowns(run.recording, run.poses.frames, device).has_clock
     tried = [(each, supposing(each.recording, True)) for each in suppositions(run.recording, is_continuous)]
-    enough_px = MENDED * _apart_px(supposing(None, True))
+    enough_px = (CLOSER if only_tests_fail else MENDED) * _apart_px(supposing(None, True))
     # Corrections of cameras and bases far beyond their priors can bring the contours together too: weak ones come last.
     found = sorted(
         (not other.result.trustworthy, _apart_px(other), each.cause, each.recording)
@@ -61,7 +68,11 @@ def fitting_causes(
         if _told(other) and _apart_px(other) <= enough_px
     )
     mended = [(cause, supposing(recording, False)) for _, _, cause, recording in found[:MOST_TRIED]]
-    noise = {cause: noise_of(other.result) for cause, other in mended if _told(other)}
+    noise = {
+        cause: noise_of(other.result)
+        for cause, other in mended
+        if (other.result.trustworthy if only_tests_fail else _told(other))
+    }
     noise = {cause: level for cause, level in noise.items() if np.isfinite(level)}
     return sorted(
         (cause for cause in noise if noise[cause] <= ALIKE * min(noise.values())), key=lambda cause: noise[cause]
