@@ -39,11 +39,19 @@ class Answer:
 
     @property
     def clock_s(self) -> float:
-        """Joint time less frame time, s, as far as it is known."""
+        """Joint time less frame time in the middle of the recording, s, as far as it is known."""
         recorded = 0.0 if self.placement is None else self.placement.clock_offset_s
-        found = self.result.nuisances.get("clock")
-        # One that its prior holds is no more than rounding.
-        return recorded + (self.result.kinematic_offsets.clock_s if found and not found.held else 0.0)
+        return recorded + self._found("clock")
+
+    @property
+    def clock_rate(self) -> float:
+        """By how much more that is a second later."""
+        return self._found("clock_rate")
+
+    def _found(self, name: str) -> float:
+        """A nuisance that the data tell; one that its prior holds is no more than rounding."""
+        found = self.result.nuisances.get(name)
+        return self.result.nuisance(name) if found and not found.held else 0.0
 
     @property
     def sides(self) -> tuple[Side, ...]:

@@ -108,6 +108,17 @@ def test_ethz(result, tmp_path):
     assert is_pose([t["x"], t["y"], t["z"], q["i"], q["j"], q["k"], q["w"]], POSE_M)
     # Joint time = frame time + 0.25 s; theirs: eye time = hand time + delay.
     assert raw["delay"] == -0.25
+    assert not any("NOT CONSTANT" in line for line in raw["about"])
+
+
+@pytest.mark.parametrize(("held", "said"), [(False, True), (True, False)])
+def test_ethz_says_that_one_delay_is_not_all_where_the_clocks_differ_in_rate(result, tmp_path, held, said):
+    rate = {"clock_rate": {"value": 0.04, "sigma": 0.001, "unit": "relative", "held": held}}
+    slow = replace(result, nuisances=result.nuisances | rate)
+    raw = json.loads(rc.export(slow, "ethz", tmp_path / "calibration.json").read_text())
+    assert raw["delay"] == -0.25
+    # By hand: 10 s after the middle, joint time = frame time + 0.25 + 0.4 s: the delay falls by 0.04 s a second.
+    assert any("NOT CONSTANT" in line and "-0.04 s a second" in line for line in raw["about"]) == said
 
 
 def test_easy_handeye2(result, tmp_path):

@@ -63,6 +63,25 @@ def test_points_are_moved_to_where_they_were_when_the_middle_row_was_read(rollin
         assert np.sqrt((as_read**2).mean()) > 5 * np.sqrt((at_middle**2).mean())  # what was measured
 
 
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_labelled_head_points_are_moved_as_well(rolling, side) -> None:
+    """By what lies, in the generator's truth, between where the point was with its own row and with the middle one."""
+    folder, recording, run = rolling
+    truth, camera, frames = np.load(folder / "truth.npz"), getattr(recording.stereo, side), run.poses.frames
+
+    def xy(uv):
+        return camera.undistort_points(torch.as_tensor(uv))[0].numpy()
+
+    labels, points = np.full((recording.n_frames, 2), np.nan), recording.head_points
+    labels[points.frames] = xy(getattr(points, f"uv_{side}"))
+    moved_px = 700.0 * (getattr(run.observations, f"head_{side}") - labels[frames])
+    expected_px = 700.0 * (xy(truth[f"{side}_head_uv"]) - xy(truth[f"{side}_head_uv_read"]))[frames]
+    seen = np.isfinite(moved_px).all(-1)
+    assert seen.sum() > 20
+    assert np.abs(expected_px[seen]).max() > 0.1
+    np.testing.assert_allclose(moved_px[seen], expected_px[seen], atol=0.02)
+
+
 def test_the_answer_is_that_of_the_shaft_and_evaluate_says_the_same(rolling) -> None:
     folder, recording, run = rolling
     result = run.result

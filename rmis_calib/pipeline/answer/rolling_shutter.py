@@ -24,6 +24,7 @@ ROUNDS = 6
 """Solves at most; each brings an answer that the rows spoiled ten times nearer."""
 SETTLED_PX = 0.01
 _POINTS = ("contour_xy", "axis_xy", "end_xy")
+_HEAD = "head_xy"
 
 
 def with_rows_at_one_instant(
@@ -96,13 +97,14 @@ def _steps(view: View, choice: Choice, first: CalibrationRun, last: CalibrationR
         view: what was measured, in which candidate of `choice`.
         first, last: predict the shaft when the first and when the last row is read.
     """
-    lines, ends = [], []
+    lines, ends, heads = [], [], []
     for run in (first, last):
-        planes, end = run.predicted_contours(view), run.predicted_ends(view)
-        if planes is None or end is None:
+        planes, end, head = run.predicted_contours(view), run.predicted_ends(view), run.predicted_heads(view)
+        if planes is None or end is None or head is None:
             return None
         lines.append(torch.where(choice.reversed[:, None, None], planes.flip(1), planes))  # (m, 2, 3)
         ends.append(end[:, None, :2] / end[:, None, 2:])
+        heads.append(head[:, :2] / head[:, 2:])
     if view.camera is None:
         return None
     found, camera = view.at(first.poses.frames), view.camera.to(torch.float64, ends[0].device)
@@ -121,7 +123,17 @@ def _steps(view: View, choice: Choice, first: CalibrationRun, last: CalibrationR
     contour_xy, axis_xy, end_xy = (getattr(found, name).double() for name in _POINTS)
     along = torch.nan_to_num(share(end_xy) * (ends[0] - ends[1]))
     steps = across(contour_xy, *edges), across(axis_xy, *axes), along
-    return dict(zip(_POINTS, steps, strict=True))
+    labelled = row_delay_s(camera, _labelled_rows(view, first).to(heads[0]), 1.0)[:, None]
+    return dict(zip(_POINTS, steps, strict=True)) | {_HEAD: torch.nan_to_num(labelled * (heads[0] - heads[1]))}
+
+
+def _labelled_rows(view: View, run: CalibrationRun) -> Float[Tensor, " m"]:
+    """Row of each motion's labelled head point, px; NaN where there is none."""
+    rows, points = np.full(run.recording.n_frames, np.nan), run.recording.head_points
+    uv = None if points is None else points.uv_left if view.side == "left" else points.uv_right
+    if points is not None and uv is not None:
+        rows[points.frames] = uv[:, 1]
+    return torch.from_numpy(rows[run.poses.frames])
 
 
 def _lines(planes: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
@@ -130,9 +142,11 @@ def _lines(planes: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
 
 
 def _moved(view: View, frames: np.ndarray, steps: dict[str, Tensor]) -> View:
-    """The view with the detections of some frames moved."""
+    """The view with the detections of some frames moved, and how far to move their labelled head points."""
     index, values = torch.as_tensor(frames, device=view.detections.valid.device), {}
-    for name, step in steps.items():
+    for name in _POINTS:
         value = getattr(view.detections, name)
-        values[name] = value.index_add(0, index, step.to(value.dtype))
-    return replace(view, detections=replace(view.detections, **values))
+        values[name] = value.index_add(0, index, steps[name].to(value.dtype))
+    head = steps[_HEAD]
+    head_step = head.new_zeros(len(view.detections.valid), 2).index_add(0, index.to(head.device), head)
+    return replace(view, detections=replace(view.detections, **values), head_step=head_step)

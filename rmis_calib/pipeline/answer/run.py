@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from rmis_calib.geometry.cameras import Camera
+from rmis_calib.geometry.rigid import transform_points
 from rmis_calib.io import Recording, ShaftObservations
 from rmis_calib.pipeline.answer.view_edges import ViewEdges
 from rmis_calib.pipeline.arms.poses import MotionPoses, predict_contours, predict_ends
@@ -81,6 +82,13 @@ class CalibrationRun:
             if camera_T_arm is None
             else predict_ends(camera_T_arm, self.poses, self.result.nuisance("end_offset", 0.0))
         )
+
+    def predicted_heads(self, view: View) -> Float[Tensor, "m 3"] | None:
+        """Where the result puts the head point, mm, in one view's camera."""
+        camera_T_arm = self.camera_T_arm(view)
+        if camera_T_arm is None:
+            return None
+        return transform_points(camera_T_arm @ self.poses.arm_T_rcm, self.poses.rcm_p_head)
 
     def camera_T_arm(self, view: View) -> Float[Tensor, "4 4"] | None:
         """The answer in one view's camera; None without one."""

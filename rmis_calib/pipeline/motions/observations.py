@@ -55,7 +55,7 @@ def assemble(
         sigma_lens=errors.lens_sigma,
         sigma_readout=_readout_sigma(recording, config),
         sigma_rcm_mm=recording.robot.rcm_sigma_mm,
-        **head_observations(recording, poses),
+        **head_observations(recording, poses, views),
         **arrays,
     )
 
@@ -85,12 +85,13 @@ def setup_observations(poses: MotionPoses) -> dict[str, Any]:
     return arrays
 
 
-def head_observations(recording: Recording, poses: MotionPoses) -> dict[str, Any]:
-    """Labelled head points as normalised undistorted coordinates, NaN where there is none."""
+def head_observations(recording: Recording, poses: MotionPoses, views: tuple[View, ...]) -> dict[str, Any]:
+    """Labelled head points as normalised undistorted coordinates, NaN where there is none; moved as their view says."""
     points = recording.head_points
     if points is None:
         return {}
     arrays = {"rcm_p_head": poses.rcm_p_head.cpu().numpy()}
+    steps = {view.side: view.head_step for view in views}
     for side, camera, uv in (
         ("right", recording.stereo.right, points.uv_right),
         ("left", recording.stereo.left, points.uv_left),
@@ -100,6 +101,8 @@ def head_observations(recording: Recording, poses: MotionPoses) -> dict[str, Any
         xy, valid = camera.undistort_points(torch.as_tensor(uv))
         by_frame = np.full((recording.n_frames, 2), np.nan)
         by_frame[points.frames] = np.where(valid.numpy()[:, None], xy.numpy(), np.nan)
+        step = steps.get(side)
+        by_frame = by_frame if step is None else by_frame + step.cpu().numpy()
         arrays[f"head_{side}"] = by_frame[poses.frames]
     return arrays
 

@@ -70,6 +70,8 @@ class View:
         camera: its intrinsics; None where lines are in pixels.
         detections: candidates of every frame, leading axis N.
         change: largest change of each picture from the one before, levels of 255; infinite where it was not looked at.
+        head_step: (N, 2) how far labelled head points are to be moved to where they were when the middle row was read,
+            normalised units; None: they stay.
     """
 
     side: str
@@ -77,6 +79,7 @@ class View:
     camera: Camera | None
     detections: ShaftDetections
     change: Tensor
+    head_step: Tensor | None = None
 
     @property
     def found(self) -> Tensor:

@@ -180,7 +180,7 @@ def _measured(
 
 
 def _labelled(run: CalibrationRun, view: View, camera: Camera) -> Float[Tensor, "m 2"] | None:
-    """Labelled head points of one camera, normalised undistorted coordinates; NaN for none."""
+    """Labelled head points of one camera, normalised undistorted coordinates, moved as the view says; NaN for none."""
     heads = run.recording.head_points
     uv = None if heads is None else heads.uv_right if view.side == "right" else heads.uv_left
     if heads is None or uv is None:
@@ -188,6 +188,7 @@ def _labelled(run: CalibrationRun, view: View, camera: Camera) -> Float[Tensor, 
     xy, valid = camera.undistort_points(torch.as_tensor(uv, dtype=torch.float64))
     by_frame = torch.full((run.recording.n_frames, 2), torch.nan, dtype=torch.float64)
     by_frame[torch.as_tensor(heads.frames)] = torch.where(valid[:, None], xy, torch.nan)
+    by_frame = by_frame if view.head_step is None else by_frame + view.head_step.cpu()
     return by_frame[torch.as_tensor(run.poses.frames)]
 
 
