@@ -20,11 +20,11 @@ def browse(page: Path, *options: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout
 
 
-def page_that(tmp_path: Path, written: str, script: str) -> str:
+def page_that(tmp_path: Path, written: str, script: str, *options: str) -> str:
     """The report after a script ran in it, as the browser writes it down."""
     page = tmp_path / "report.html"
     page.write_text(written.replace("</body>", f"<script>{script}</script></body>"), "utf-8")
-    return browse(page, "--virtual-time-budget=2000", "--dump-dom")
+    return browse(page, "--virtual-time-budget=2000", "--dump-dom", *options)
 
 
 @pytest.mark.parametrize("name", ["rendered_run", "run_with_rejections", "refused_run"])
@@ -55,6 +55,41 @@ def test_the_script_draws_what_the_page_was_written_with(pages: dict[str, tuple[
             assert np.allclose([mine.min(0), mine.max(0)], [first.min(0), first.max(0)], atol=0.6)
         else:
             assert np.allclose(mine, first, atol=0.11)  # one decimal is written
+    labels = [re.findall(r"<text [^>]*>(?:camera|base|RCM|arm|head)[^<]*</text>", text) for text in (dom, page)]
+    assert len(labels[0]) == 6
+    places = [[re.findall(r' (d[xy]|text-anchor)="([^"]*)"', label) for label in found] for found in labels]
+    assert places[0] == places[1]
+
+
+@pytest.mark.parametrize(("window", "size"), [("--window-size=1280,900", "15px"), ("--window-size=500,900", "30px")])
+def test_no_view_of_the_scene_has_labels_on_each_other(
+    pages: dict[str, tuple[Path, str]], tmp_path: Path, window: str, size: str
+) -> None:
+    """As the browser measures its own letters, turned all around and from near and far."""
+    script = """
+    const s = document.getElementById('scene-view'), met = new Set();
+    const press = (key) => s.dispatchEvent(new KeyboardEvent('keydown', { key }));
+    let views = 0;
+    const look = () => {
+      const texts = [...s.querySelectorAll('text')], boxes = texts.map((text) => text.getBBox());
+      views += boxes.length > 1;
+      boxes.forEach((a, i) => boxes.slice(0, i).forEach((b, k) => {
+        // A box has the font's whole line: letters are at most from 0.15 below its top to 0.05 above its end.
+        const gap = 0.2 * Math.min(a.height, b.height);
+        if (a.x < b.x + b.width && b.x < a.x + a.width && a.y + gap < b.y + b.height && b.y + gap < a.y + a.height)
+          met.add(texts[i].textContent + ' on ' + texts[k].textContent);
+      }));
+    };
+    for (const zooms of ['', '+++', '---', '----------']) {
+      press('0'); [...zooms].forEach(press);
+      for (let turn = 0; turn < 63; turn += 1) { press('ArrowLeft'); if (turn % 9 == 0) press('ArrowUp'); look(); }
+    }
+    const size = getComputedStyle(s.querySelector('text')).fontSize;
+    document.body.dataset.looked = [views, size, ...met].join('; ');
+    """
+    dom = page_that(tmp_path, pages["rendered_run"][1], script, window)
+    looked = re.search(r'data-looked="([^"]*)"', dom)
+    assert looked is not None and looked.group(1) == f"252; {size}"
 
 
 def test_the_scene_turns_and_steps_and_a_picture_opens(pages: dict[str, tuple[Path, str]], tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from rmis_calib.pipeline.answer.run import CalibrationRun
 from rmis_calib.pipeline.scene import PlacedCameras, Scene, advised_scene, place_cameras, scene_of
 from rmis_calib.report.drawing.frames import spread
+from rmis_calib.report.drawing.labels import MEASURES, place_labels
 from rmis_calib.report.drawing.working_point import ellipse
 
 MOST_MOTIONS = 60
@@ -24,6 +25,8 @@ _MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100)
 _LARGE_MM = 25.0
 """Longest half axis of the enlarged ellipsoid."""
 _FRUSTUM_MM = 20.0
+_LABELLED_LEFT = ("base", "head point")
+"""Labels that try the left first: the axes and the shaft mostly lead to the right in the first view."""
 YAW_RAD, PITCH_RAD = math.radians(-45.0), math.radians(23.0)
 """First view: from the side, a little from above (base's z is up)."""
 SIZE = (960.0, 540.0)
@@ -38,7 +41,7 @@ class SceneDrawing:
 
     Attributes:
         data: for the page's script: plain values.
-        shapes: the first view, for pages without a script: plain SVG attributes, the farthest first.
+        shapes: the first view, for pages without a script: plain SVG attributes, the farthest first, the labels last.
         magnification: how many times larger than true the enlarged ellipsoid is; 1: there is none.
         sigma_mm: half axes of the true ellipsoid, the largest first; empty where it is unknown.
         has_answer: whether the cameras are placed.
@@ -70,13 +73,14 @@ def draw_scene(run: CalibrationRun) -> SceneDrawing | None:
         "dots": [_line("trail", scene.end)],
         "discs": _discs(scene, cameras),
         "ellipsoids": _ellipsoids(cameras, magnification),
+        "labels": MEASURES,
         "view": {"yaw": YAW_RAD, "pitch": PITCH_RAD, "size": list(SIZE)} | _fitted(scene, cameras),
     }
     return SceneDrawing(data, tuple(project(data, 0)), magnification, sigma_mm, has_answer)
 
 
 def project(data: dict[str, Any], motion: int) -> list[dict[str, Any]]:
-    """The shapes of one motion in the first view, the farthest first; what scene.js does for every view."""
+    """The shapes of one motion in the first view, the farthest first, labels last; scene.js does it for every view."""
     view = data["view"]
     right, up, towards = view_axes(view["yaw"], view["pitch"])
     centre, scale = np.array(view["centre"]), view["scale"]
@@ -105,10 +109,22 @@ def project(data: dict[str, Any], motion: int) -> list[dict[str, Any]]:
     for disc in data["discs"]:
         point = _at(disc["at"], motion)
         depth = float((point - centre) @ towards) + 1e-3
-        shapes.append(
-            {"kind": "disc", "style": disc["style"], "points": flat(point[None]), "name": disc["name"], "depth": depth}
-        )
-    return sorted(shapes, key=lambda shape: shape["depth"])
+        shapes.append({"kind": "disc", "style": disc["style"], "points": flat(point[None]), "depth": depth})
+    labelled = flat(np.array([_at(disc["at"], motion) for disc in data["discs"]]))
+    return sorted(shapes, key=lambda shape: shape["depth"]) + _labels(data, labelled)
+
+
+def _labels(data: dict[str, Any], points: Float[np.ndarray, "n 2"]) -> list[dict[str, Any]]:
+    """The labels over everything else: the shaft would hide what it crosses."""
+    discs = data["discs"]
+    names, sides = [disc["name"] for disc in discs], [disc["side"] for disc in discs]
+    places = place_labels(points, names, sides, tuple(data["view"]["size"]))
+    return [
+        {"kind": "label", "style": disc["style"], "points": point[None], "name": disc["name"], "place": place}
+        | {"depth": math.inf}
+        for disc, point, place in zip(discs, points, places, strict=True)
+        if place is not None
+    ]
 
 
 def view_axes(yaw: float, pitch: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -156,6 +172,7 @@ def _discs(scene: Scene, cameras: PlacedCameras | None) -> list[dict[str, Any]]:
         points |= {f"camera {side}": pose[:, :3, 3] for side, pose in cameras.base_T_camera.items()}
     return [
         {"style": name.replace(" ", "-").lower(), "name": name, "at": np.round(at, 2).tolist()}
+        | {"side": -1 if name in _LABELLED_LEFT else 1}
         for name, at in points.items()
     ]
 

@@ -50,13 +50,51 @@
       shapes.push([depth(centre), make("polygon", { class: `o-${item.style}`, points: written(points) })]);
     }
     for (const disc of data.discs) {
-      const point = at(disc.at), [x, y] = flat(point), group = make("g", { class: `disc d-${disc.style}` });
-      group.append(make("circle", { cx: x.toFixed(1), cy: y.toFixed(1), r: 5 }));
-      group.append(make("text", { x: (x + 9).toFixed(1), y: (y + (disc.name === "base" ? 20 : -7)).toFixed(1) }, disc.name));
-      shapes.push([depth(point) + 1e-3, group]);
+      const point = at(disc.at), [x, y] = flat(point);
+      const attributes = { class: `d-${disc.style}`, cx: x.toFixed(1), cy: y.toFixed(1), r: 5 };
+      shapes.push([depth(point) + 1e-3, make("circle", attributes)]);
     }
     shapes.sort((a, b) => a[0] - b[0]);
-    svg.replaceChildren(...shapes.map((shape) => shape[1]));
+    const labels = data.discs.map((disc) => ({ name: disc.name, side: disc.side, point: flat(at(disc.at)) }));
+    svg.replaceChildren(...shapes.map((shape) => shape[1]), ...placed(labels).map((label) => make("text", {
+      x: label.point[0].toFixed(1), y: label.point[1].toFixed(1), dx: `${label.dx.toFixed(2)}em`,
+      dy: `${label.dy.toFixed(2)}em`, "text-anchor": label.dx > 0 ? "start" : "end",
+    }, label.name)));
+  }
+
+  // The labels of the points inside the drawing, each at its nearest free place, as drawing/labels.py placed them.
+  function placed(labels) {
+    const { text_sizes: sizes, letter, wide_letter: wide, ascent, descent, line } = data.labels;
+    const { beside, above, below, disc, rows } = data.labels;
+    const inside = labels.filter(({ point: [x, y] }) => x >= 0 && x <= width && y >= 0 && y <= height);
+    const done = [];
+    const box = ({ name, point: [x, y] }, { side, dy }, size) => {
+      const ends = [side * beside, side * (beside + letter * name.length + wide)].sort((a, b) => a - b);
+      return [x + size * ends[0], y + size * (dy - ascent), x + size * ends[1], y + size * (dy + descent)];
+    };
+    const around = ({ point: [x, y] }, r) => [x - r, y - r, x + r, y + r];
+    const overlap = (a, b) => Math.max(Math.min(a[2], b[2]) - Math.max(a[0], b[0]), 0)
+      * Math.max(Math.min(a[3], b[3]) - Math.max(a[1], b[1]), 0);
+    const covered = (label, place) => sizes.reduce((total, size) => {
+      const mine = box(label, place, size);
+      const taken = done.map((other) => box(other, other.place, size));
+      for (const other of labels) if (other !== label) taken.push(around(other, disc * size));
+      const outside = overlap(mine, mine) - overlap(mine, [0, 0, width, height]);
+      return total + (outside + taken.reduce((sum, other) => sum + overlap(mine, other), 0)) / size ** 2;
+    }, 0);
+    for (const label of inside.sort((a, b) => b.point[0] - a.point[0])) {
+      let least = Infinity;
+      for (let row = 0; row < rows; row += 1) {
+        for (const dy of [above - line * row, below + line * row]) {
+          for (const side of [label.side, -label.side]) {
+            const cost = covered(label, { side, dy });
+            if (cost < least) [least, label.place] = [cost, { side, dy }];
+          }
+        }
+      }
+      done.push(label);
+    }
+    return labels.filter((label) => label.place).map((label) => ({ ...label, dx: label.place.side * beside, dy: label.place.dy }));
   }
 
   // Outline of an ellipsoid seen along a direction: that of its covariance in the plane of the drawing.
