@@ -73,8 +73,13 @@ class Shafts:
             return cls(**{name: np.stack([truth[prefix + name] for prefix in prefixes]) for name in names})
 
     def errors_px(self, points: np.ndarray, frame: int, focal: float) -> np.ndarray:
-        """(S,) contour error of (edge, point, xy) against every shaft; infinite for one that is not there."""
-        return np.where(self.visible[:, frame], rms_px(points, self.n_contour_read[:, frame], focal), np.inf)
+        """(S,) contour error of (edge, point, xy) against every shaft; infinite for one of which too little shows to be
+        asked for."""
+        return np.where(self.visible[:, frame], self.any_errors_px(points, frame, focal), np.inf)
+
+    def any_errors_px(self, points: np.ndarray, frame: int, focal: float) -> np.ndarray:
+        """The same, also of those: a line on one is right where it is found all the same."""
+        return rms_px(points, self.n_contour_read[:, frame], focal)
 
     def instant_px(self, points: np.ndarray, frame: int, focal: float) -> float:
         """Contour error against the logged shaft as it was at the frame's own instant."""
@@ -155,13 +160,14 @@ def count_ours(tally: Tally, found: ShaftDetections, j: int, n: int, truth: Shaf
     errors = np.full((len(ranks), truth.visible.shape[0]), np.inf)
     for i, k in enumerate(ranks):
         points = found.contour_xy[j, k].double().numpy()
-        errors[i] = truth.errors_px(points, n, focal)
-        if not found.direction_known[j, k]:  # then which contour is the left one is not claimed either
-            errors[i] = np.minimum(errors[i], truth.errors_px(points[::-1], n, focal))
+        orders = (
+            [points] if found.direction_known[j, k] else [points, points[::-1]]
+        )  # which is left is not claimed then
+        errors[i] = np.min([truth.errors_px(order, n, focal) for order in orders], axis=0)
+        nearest = min(float(truth.any_errors_px(order, n, focal).min()) for order in orders)
         sigma_px = float(found.contour_sigma[j, k].double().square().mean().sqrt()) * focal
-        right = errors[i].min() <= FOUND_PX
-        tally.stray += not right
-        tally.graded.append((float(found.confidence[j, k]), bool(right), bool(errors[i].min() < 3 * sigma_px)))
+        tally.stray += nearest > FOUND_PX
+        tally.graded.append((float(found.confidence[j, k]), nearest <= FOUND_PX, nearest < 3 * sigma_px))
     if not truth.visible[0, n]:
         return
     tally.visible += 1
