@@ -23,6 +23,10 @@ class HeadPoints:
     uv_left: np.ndarray | None
     """(M, 2) px in the raw left image; None where the file has no left columns."""
 
+    def uv(self, side: str) -> np.ndarray | None:
+        """Those in one camera's images: `right` or `left`."""
+        return self.uv_left if side == "left" else self.uv_right
+
 
 def read_frame_times(path: str | Path) -> np.ndarray:
     """Time of each frame, (N,) s.

@@ -13,7 +13,7 @@ from rmis_calib.errors import InputError, VideoError
 from rmis_calib.geometry.cameras import Camera, StereoRig
 from rmis_calib.io import FrameSource, JointLog, Recording
 from rmis_calib.pipeline.arms.poses import MotionPoses
-from rmis_calib.pipeline.pictures.detection import View, concatenate
+from rmis_calib.pipeline.pictures.detection import View
 from rmis_calib.pipeline.pictures.frozen import ChangeMeter
 from rmis_calib.robot import Robot
 from rmis_calib.vision import ShaftDetections
@@ -146,5 +146,7 @@ class Collected:
         views = []
         for side, camera in self.cameras().items():
             source = SeenFrames(camera.image_size, len(self), self._pictures[side])
-            views.append(View(side, source, camera, concatenate(self._found[side]), torch.cat(self._changes[side])))
+            views.append(
+                View(side, source, camera, ShaftDetections.joined(self._found[side]), torch.cat(self._changes[side]))
+            )
         return tuple(views)

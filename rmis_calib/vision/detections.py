@@ -1,5 +1,6 @@
 """What the detector says of a batch of pictures, and how two looks at the same picture become one answer."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 
@@ -114,6 +115,16 @@ class ShaftDetections:
     def of_frames(self, which: Bool[Tensor, " b"] | Int[Tensor, " m"]) -> "ShaftDetections":
         """Those of the frames in the mask, or of these numbers."""
         return ShaftDetections(**{name: value[which] for name, value in vars(self).items()})
+
+    def put(self, which: Bool[Tensor, " b"] | Int[Tensor, " m"], found: "ShaftDetections") -> None:
+        """Write what was found into the frames in the mask, or of these numbers, in place of what is there."""
+        for name, value in vars(self).items():
+            value[which] = getattr(found, name)
+
+    @classmethod
+    def joined(cls, parts: Sequence["ShaftDetections"]) -> "ShaftDetections":
+        """Frames of several batches, one after the other."""
+        return cls(**{name: torch.cat([getattr(part, name) for part in parts]) for name in vars(parts[0])})
 
     def surest_first(self) -> "ShaftDetections":
         """The same with the candidates of each frame in the order of their confidence."""

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from rmis_calib.errors import ShapeError
 from rmis_calib.geometry import Camera
-from rmis_calib.vision.coarse.guided import COARSER, trace_near
-from rmis_calib.vision.coarse.search import SearchTrace, StripCandidates, search, trace_along
+from rmis_calib.vision.coarse.guided import COARSER, trace_along, trace_near
+from rmis_calib.vision.coarse.search import SearchTrace, StripCandidates, search
 from rmis_calib.vision.coarse.strips import between, listed_between
 from rmis_calib.vision.detections import EndKind, FrameReason, ShaftDetections, merge, needs_second_pass
 from rmis_calib.vision.fine.expected import where_expected
@@ -68,9 +68,7 @@ class ShaftDetector:
         if not bool(again.any()):
             return found
         second, _ = self._look(pick_pictures(images, again), None, broken[again], 2)
-        better = merge(found.of_frames(again), second, twice)
-        for name, value in vars(found).items():
-            value[again] = getattr(better, name)
+        found.put(again, merge(found.of_frames(again), second, twice))
         return found
 
     def look_along(self, images: Tensor, contour_n: Float[Tensor, "b 2 3"]) -> ShaftDetections:
@@ -124,11 +122,7 @@ class ShaftDetector:
             canvas = self._canvas(images, COARSER)
             strips, keep = listed_between(self.lens.to_ideal_lines(expected), canvas)
             found = trace_near(images, canvas, self.settings, strips, keep)
-            seen = measure(images, found, self.lens, self.settings)
-            clear = seen.clear & ((found.scores > 0) & ~broken[:, None])[found.keep]
-            valid = clear & seen.plausible & (seen.certain >= self.settings.min_confidence)
-            fields = seen.fields(valid, seen.certain, self.lens, self.settings)
-            fields = {name: _spread(value, found.keep) for name, value in fields.items()}
+            fields, _ = self._judged(images, found, broken)
             reason = torch.where(fields["valid"].any(1), int(FrameReason.OK), int(FrameReason.EDGES_UNCLEAR))
             reason = torch.where(broken, int(FrameReason.BAD_PIXELS), reason)
         return ShaftDetections(reason=reason, **{name: value.clone() for name, value in fields.items()})
@@ -187,14 +181,21 @@ class ShaftDetector:
     def _measure(
         self, images: Tensor, found: StripCandidates, stages: SearchTrace, broken: Bool[Tensor, " b"]
     ) -> ShaftDetections:
-        """Sub-pixel contours, axis and end of the traced strips."""
+        """Sub-pixel contours, axis and end of the searched strips, and why a frame shows none."""
+        fields, clear = self._judged(images, found, broken)
+        reason = _reason(stages, found.scores, clear, fields["valid"], broken)
+        return ShaftDetections(reason=reason, **fields).surest_first()
+
+    def _judged(
+        self, images: Tensor, found: StripCandidates, broken: Bool[Tensor, " b"]
+    ) -> tuple[dict[str, Tensor], Bool[Tensor, "b k"]]:
+        """Sub-pixel contours, axis and end of the traced strips, as fields of `ShaftDetections`, and whether their
+        contours are clear."""
         strips = measure(images, found, self.lens, self.settings)
         clear = strips.clear & ((found.scores > 0) & ~broken[:, None])[found.keep]
         valid = clear & strips.plausible & (strips.certain >= self.settings.min_confidence)
         fields = strips.fields(valid, strips.certain, self.lens, self.settings)
-        fields = {name: _spread(value, found.keep) for name, value in fields.items()}
-        reason = _reason(stages, found.scores, _spread(clear, found.keep), fields["valid"], broken)
-        return ShaftDetections(reason=reason, **fields).surest_first()
+        return {name: _spread(value, found.keep) for name, value in fields.items()}, _spread(clear, found.keep)
 
 
 def checked_places(contour_n: Tensor, images: Tensor) -> None:

@@ -130,7 +130,7 @@ def _steps(view: View, choice: Choice, first: CalibrationRun, last: CalibrationR
 def _labelled_rows(view: View, run: CalibrationRun) -> Float[Tensor, " m"]:
     """Row of each motion's labelled head point, px; NaN where there is none."""
     rows, points = np.full(run.recording.n_frames, np.nan), run.recording.head_points
-    uv = None if points is None else points.uv_left if view.side == "left" else points.uv_right
+    uv = None if points is None else points.uv(view.side)
     if points is not None and uv is not None:
         rows[points.frames] = uv[:, 1]
     return torch.from_numpy(rows[run.poses.frames])

@@ -4,9 +4,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from rmis_calib.config import CalibrationConfig
+from rmis_calib.geometry.cameras import Camera
 from rmis_calib.io import Recording, ShaftObservations
 from rmis_calib.pipeline.arms.poses import MotionPoses
 from rmis_calib.pipeline.motions.association import Choice, reversed_direction
@@ -92,19 +94,31 @@ def head_observations(recording: Recording, poses: MotionPoses, views: tuple[Vie
         return {}
     arrays = {"rcm_p_head": poses.rcm_p_head.cpu().numpy()}
     steps = {view.side: view.head_step for view in views}
-    for side, camera, uv in (
-        ("right", recording.stereo.right, points.uv_right),
-        ("left", recording.stereo.left, points.uv_left),
-    ):
-        if camera is None or uv is None:
-            continue
-        xy, valid = camera.undistort_points(torch.as_tensor(uv))
-        by_frame = np.full((recording.n_frames, 2), np.nan)
-        by_frame[points.frames] = np.where(valid.numpy()[:, None], xy.numpy(), np.nan)
-        step = steps.get(side)
-        by_frame = by_frame if step is None else by_frame + step.cpu().numpy()
-        arrays[f"head_{side}"] = by_frame[poses.frames]
+    for side, camera in (("right", recording.stereo.right), ("left", recording.stereo.left)):
+        xy = None if camera is None else labelled_heads(recording, side, camera, steps.get(side))
+        if xy is not None:
+            arrays[f"head_{side}"] = xy[poses.frames].numpy()
     return arrays
+
+
+def labelled_heads(
+    recording: Recording, side: str, camera: Camera, step: Float[Tensor, "n 2"] | None
+) -> Float[Tensor, "n 2"] | None:
+    """Labelled head points of one camera in every frame, normalised undistorted coordinates; NaN where there is none.
+
+    Args:
+        recording: with the labels.
+        side: `right` or `left`.
+        camera: by which they are undistorted.
+        step: how far they are to be moved (`View.head_step`).
+    """
+    uv = None if recording.head_points is None else recording.head_points.uv(side)
+    if recording.head_points is None or uv is None:
+        return None
+    xy, valid = camera.undistort_points(torch.as_tensor(uv, dtype=torch.float64))
+    by_frame = torch.full((recording.n_frames, 2), torch.nan, dtype=torch.float64)
+    by_frame[torch.as_tensor(recording.head_points.frames)] = torch.where(valid[:, None], xy, torch.nan)
+    return by_frame if step is None else by_frame + step.cpu()
 
 
 def reasons_for(view: View, poses: MotionPoses, choice: Choice) -> np.ndarray:

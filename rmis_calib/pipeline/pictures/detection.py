@@ -4,7 +4,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -220,8 +220,7 @@ def _detect_views(
             # Into one table each: small tensors of every batch, kept, would scatter over memory between those that go.
             if camera.side not in tables:
                 tables[camera.side] = over_all(found, camera.source.count, batch.indices)
-            for name, value in vars(tables[camera.side]).items():
-                value[batch.indices] = getattr(found, name)
+            tables[camera.side].put(batch.indices, found)
             changes[camera.side][batch.indices] = meters[camera.side](batch.images).cpu()
             watch(DetectedBatch(camera.side, camera.source, camera.times_s, detector, batch, masks, found))
             done[camera.side] += len(batch.indices)
@@ -283,12 +282,6 @@ def detecting_threads(device: str, at_once: int | None = None) -> Iterator[tuple
         finally:
             executor.shutdown(wait=True, cancel_futures=True)
             torch.set_num_threads(threads)  # what a thread sets for itself is the default of later ones too
-
-
-def concatenate(parts: list[ShaftDetections]) -> ShaftDetections:
-    """Batches of detections, one after the other."""
-    joined = {f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(ShaftDetections)}
-    return ShaftDetections(**joined)
 
 
 def over_all(found: ShaftDetections, count: int, searched: Tensor) -> ShaftDetections:

@@ -72,19 +72,20 @@ def detect_run(detector: ShaftDetector, images: Tensor, search_every: int, at_on
     found = _detect(detector, images, places, at_once)
     if len(places) == len(images):
         return found
-    fields = {name: value.new_zeros(len(images), *value.shape[1:]) for name, value in vars(found).items()}
-    _put(fields, places, found)
+    empty = {name: value.new_zeros(len(images), *value.shape[1:]) for name, value in vars(found).items()}
+    table, device = ShaftDetections(**empty), found.valid.device
+    table.put(places.to(device), found)
     left = torch.ones(len(images), dtype=torch.bool)
     left[places] = False
-    stretches = _stretches(found, places.to(found.valid.device))
+    stretches = _stretches(found, places.to(device))
     if any(len(stretch.between) for stretch in stretches):
         confirmed, looked = _between(detector, images, stretches)
-        _put(fields, confirmed, looked)
+        table.put(confirmed.to(device), looked)
         left[confirmed] = False
     again = left.nonzero()[:, 0]
     if len(again):
-        _put(fields, again, _detect(detector, images, again, at_once))
-    return ShaftDetections(**fields)
+        table.put(again.to(device), _detect(detector, images, again, at_once))
+    return table
 
 
 def _between(
@@ -112,13 +113,7 @@ def _searched(count: int, search_every: int) -> Int64[Tensor, " a"]:
 
 
 def _detect(detector: ShaftDetector, images: Tensor, places: Int64[Tensor, " n"], at_once: int) -> ShaftDetections:
-    parts = [vars(detector.detect(pick_pictures(images, which))) for which in places.split(at_once)]
-    return ShaftDetections(**{name: torch.cat([part[name] for part in parts]) for name in parts[0]})
-
-
-def _put(fields: dict[str, Tensor], places: Int64[Tensor, " n"], found: ShaftDetections) -> None:
-    for name, value in vars(found).items():
-        fields[name][places.to(value.device)] = value
+    return ShaftDetections.joined([detector.detect(pick_pictures(images, which)) for which in places.split(at_once)])
 
 
 @dataclass(frozen=True, eq=False)

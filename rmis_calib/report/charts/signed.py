@@ -16,6 +16,7 @@ from rmis_calib.geometry.lines import contour_planes, point_line_distance
 from rmis_calib.pipeline.answer.predicted_shaft import PredictedShaft, in_picture, predict_shaft
 from rmis_calib.pipeline.answer.run import CalibrationRun
 from rmis_calib.pipeline.motions.association import reversed_direction
+from rmis_calib.pipeline.motions.observations import labelled_heads
 from rmis_calib.pipeline.pictures.detection import View
 from rmis_calib.pipeline.scene import readings_of
 
@@ -168,8 +169,9 @@ def _measured(
     end = torch.stack(corrected_point(end[:, 0], end[:, 1], *off), dim=-1)
     if "end_offset" in run.result.nuisances:
         kinds["end"] = (((end - _flat(predicted.end)) * along).sum(-1), end, along)
-    heads = _labelled(run, view, camera)
-    if heads is not None:
+    labelled = labelled_heads(run.recording, view.side, camera, view.head_step)
+    if labelled is not None:
+        heads = labelled[torch.as_tensor(run.poses.frames)]
         gap = heads - _flat(predicted.head)
         kinds["head_across"] = ((gap * right).sum(-1), heads, right)
         kinds["head_along"] = ((gap * along).sum(-1), heads, along)
@@ -177,19 +179,6 @@ def _measured(
         kind: (focal * value.numpy(), in_picture(camera, _deep(xy)), direction.numpy())
         for kind, (value, xy, direction) in kinds.items()
     }
-
-
-def _labelled(run: CalibrationRun, view: View, camera: Camera) -> Float[Tensor, "m 2"] | None:
-    """Labelled head points of one camera, normalised undistorted coordinates, moved as the view says; NaN for none."""
-    heads = run.recording.head_points
-    uv = None if heads is None else heads.uv_right if view.side == "right" else heads.uv_left
-    if heads is None or uv is None:
-        return None
-    xy, valid = camera.undistort_points(torch.as_tensor(uv, dtype=torch.float64))
-    by_frame = torch.full((run.recording.n_frames, 2), torch.nan, dtype=torch.float64)
-    by_frame[torch.as_tensor(heads.frames)] = torch.where(valid[:, None], xy, torch.nan)
-    by_frame = by_frame if view.head_step is None else by_frame + view.head_step.cpu()
-    return by_frame[torch.as_tensor(run.poses.frames)]
 
 
 def _flat(camera_p: Float[Tensor, "m 3"]) -> Float[Tensor, "m 2"]:

@@ -94,7 +94,7 @@ def detected_marks(run: CalibrationRun, view: View, motion: int) -> list[Mark]:
         marks.append(Mark("end", view.camera.project(end)[0].numpy()[None]))
     heads = run.recording.head_points
     if heads is not None:
-        uv = heads.uv_right if view.side == "right" else heads.uv_left
+        uv = heads.uv(view.side)
         row = np.flatnonzero(heads.frames == frame)
         if uv is not None and len(row):
             marks.append(Mark("head", np.asarray(uv[row[0]], dtype=float)[None]))

@@ -22,6 +22,25 @@ def reached_borders(
     return first_on(t, run) - first_on(t, seen) < reach, last_on(t, seen) - last_on(t, run) < reach
 
 
+def enters_high(
+    t: Float[Tensor, " s"],
+    run: Bool[Tensor, "*b s"],
+    seen: Bool[Tensor, "*b s"],
+    borders: tuple[Bool[Tensor, "*b"], Bool[Tensor, "*b"]],
+) -> Bool[Tensor, "*b"]:
+    """Whether a shaft enters on the high side: it reaches that border alone, or both or none and is nearer to that one.
+
+    Args:
+        t: stations.
+        run: those of the shaft.
+        seen: those in the field of view.
+        borders: whether it reaches the low and the high border.
+    """
+    low, high = borders
+    nearer_high = last_on(t, seen) - last_on(t, run) < first_on(t, run) - first_on(t, seen)
+    return (high & ~low) | ((high == low) & nearer_high)
+
+
 def enter(
     t: Float[Tensor, " s"],
     edged: Bool[Tensor, "b k s"],

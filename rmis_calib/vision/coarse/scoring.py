@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rmis_calib.vision.coarse.appearance import weighted_tint
+from rmis_calib.vision.coarse.borders import enters_high, reached_borders
 from rmis_calib.vision.coarse.strips import SmallPicture, Strips
 from rmis_calib.vision.image.run_length import (
     bridge,
@@ -195,12 +196,9 @@ def inspect(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -
     carries_end = torch.where(carries_end.any(-1, keepdim=True), carries_end, on)
 
     alternation = _alternation(p, on, tone, surround)
-    reach = 0.5 * width + 3 * spacing
     contoured = edged & run_any(bridge(edged, 0.7 * width / spacing), on)
-    low_gap = first_on(t, contoured) - first_on(t, p.seen)
-    high_gap = last_on(t, p.seen) - last_on(t, contoured)
-    low_border, high_border = low_gap < reach, high_gap < reach
-    flip = (high_border & ~low_border) | ((high_border == low_border) & (high_gap < low_gap))
+    low_border, high_border = borders = reached_borders(t, contoured, p.seen, width)
+    flip = enters_high(t, contoured, p.seen, borders)
     start = torch.where(flip, -last_on(t, on), first_on(t, on))
     end = torch.where(flip, -first_on(t, carries_end), last_on(t, carries_end))
     return Evidence(

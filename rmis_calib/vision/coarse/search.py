@@ -131,7 +131,7 @@ def search(
     pairs = scoring.screen(picture, strips.pair(lines, picture, settings, _PAIRS), settings, count_pairs)
     evidence = scoring.inspect(picture, pairs, settings)
     scores = scoring.score(evidence, settings)
-    look = partial(_look_along, small)
+    look = partial(judge_strips, small)
     found = _best(picture, evidence, scores, settings, look)
     ridge, votes = ridge.unflatten(0, (-1, count)).any(1), votes.unflatten(0, (-1, count)).amax(1)
     lines = hough.HoughLines(**{n: v.unflatten(0, (-1, count)).flatten(1, 2) for n, v in vars(lines).items()})
@@ -140,26 +140,7 @@ def search(
     return found, SearchTrace(*pictures, lines, evidence, scores, found.scores, canvas.factor, canvas.origin)
 
 
-def trace_along(images: Tensor, canvas: Canvas, settings: DetectorSettings, expected: strips.Strips) -> StripCandidates:
-    """Contours near strips where a shaft is expected, one a picture, traced in both views; ranks are the views.
-
-    Whether one is there is left to who measures them: nothing is ranked or left out here.
-    """
-    small = small_views(images, canvas, settings, 2)
-    picture = small.picture
-    each = {name: value.repeat_interleave(picture.views, 0) for name, value in vars(expected).items()}
-    view = torch.arange(len(each["frame"]), device=expected.frame.device)
-    several = strips.Strips(**each | {"frame": view[:, None]}).listed(torch.ones_like(each["valid"]))
-    straight, _ = trace.straighten(trace.walk(picture, several, settings))
-    traced = trace.trace(picture, straight, settings)
-    keep = each["valid"].reshape(-1, picture.views)
-    scores = keep.to(traced.width.dtype)
-    everywhere, verdict = torch.ones_like(keep), _look_along(small, traced.strips)
-    number, lit = view[None] // picture.views, picture.lit(traced.strips)
-    return StripCandidates(traced, number, lit, everywhere, scores, verdict)
-
-
-def _look_along(small: SmallViews, several: strips.Strips) -> StripVerdict:
+def judge_strips(small: SmallViews, several: strips.Strips) -> StripVerdict:
     """What the network says of strips in any of the views; places of ends as stations, px."""
     number = several.frame // small.picture.views
     seen = small.picture.layers[1, :: small.picture.views]

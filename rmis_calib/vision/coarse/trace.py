@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rmis_calib.vision.coarse.borders import enter, through_the_dark, ways
+from rmis_calib.vision.coarse.borders import enter, enters_high, through_the_dark, ways
 from rmis_calib.vision.coarse.contour_profiles import StripProfiles, read_profiles
 from rmis_calib.vision.coarse.scoring import MAX_BRIGHTER
 from rmis_calib.vision.coarse.shaft_tone import (
@@ -164,10 +164,9 @@ def _walk(picture: SmallPicture, strips: Strips, settings: DetectorSettings) -> 
     to_border, borders = enter(t, stretch.contoured | hidden, stretch.main, seen, stretch.width)
     way = ways(t, stretch.on, seen)
     closed = (way & tone.brighter[:, :, None]).sum(-1) > 1
-    low, high = borders = through_the_dark(way, closed, stretch.on, borders)
+    borders = through_the_dark(way, closed, stretch.on, borders)
     stretch = stretch.with_also(to_border)
-    nearer_high = last_on(t, seen) - last_on(t, stretch.on) < first_on(t, stretch.on) - first_on(t, seen)
-    return _Walk(profiles, strips, stretch, borders, closed, (high & ~low) | ((high == low) & nearer_high))
+    return _Walk(profiles, strips, stretch, borders, closed, enters_high(t, stretch.on, seen, borders))
 
 
 def _contoured_stretch(
